@@ -25,6 +25,22 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
 
+def check_device(device: torch.device | str) -> None:
+    """Raise unless tensors can be made on a device.
+
+    Raises:
+        ValueError: with the reason.
+
+    Example:
+        >>> check_device("cpu")
+    """
+    try:
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:
+        problem = f"device {str(device)!r} cannot be used here ({str(error).splitlines()[0]})"
+        raise ValueError(f"{problem}: choose another, such as cpu") from None
+
+
 def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str) -> None:
     """Raise unless every floating-point value is finite.
 

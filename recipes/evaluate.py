@@ -98,6 +98,8 @@ class Config(ScenarioOptions):
     """Minimum probability of a correct declaration, with --arrival declared; 0 by default."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
+    device: str = "cpu"
+    """Device of the flights: cpu, cuda, cuda:0, ..."""
     out: Path = field(default_factory=free_folder)
     """Folder of the results, new or empty; by default the first free one of runs/evaluation, runs/evaluation-2, ..."""
 
@@ -160,7 +162,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         config, notes = with_training_settings(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        told = ("errors", "north", "model", "start_km", "confidence", "seed")
+        told = ("errors", "north", "model", "start_km", "confidence", "seed", "device")
         flights = [Flight(tasks, **{key: getattr(config, key) for key in told}) for tasks in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         if config.export:
@@ -183,7 +185,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
-        rollout = flight.fly(navigator)
+        rollout = flight.fly(navigator).cpu()
         measured = episode_measures(rollout)
         readings = getattr(navigator, "field_readings", torch.zeros(1)).double().mean().item()
         summary = summarize(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
@@ -199,7 +201,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.rollouts[label(name)] = rollout[:SHOWN].clone()
-            results.paths += path_rows(name, example_flight.fly(example))
+            results.paths += path_rows(name, example_flight.fly(example).cpu())
     write(config, flight, results, notes)
     return results.summaries
 
@@ -246,7 +248,7 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
 
 def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]) -> None:
     """Write the files of the results."""
-    env = flight.base
+    env = flight.base.to("cpu")
     for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
         text = io.StringIO()
         writer = csv.DictWriter(text, list(rows[0]))

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from magrl.checks import check_choice
+from magrl.checks import check_choice, check_device
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, next_rollout, restart
 from magrl.evaluation.navigators import fitted, make_navigator
@@ -85,6 +85,7 @@ class Flight:
         device: torch.device | str = "cpu",
         **options: Any,
     ) -> None:
+        check_device(device)
         self.seed = seed
         self.rules: dict[str, Any] = {"confidence": confidence, **(rules or {})}
         tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)

@@ -8,13 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-import torch
 import tyro
 from pydantic import AfterValidator, Field, model_validator
 from torchrl.envs import Transform
 
 from magrl import paper
-from magrl.checks import CheckedModel, UsageError, printable, short
+from magrl.checks import CheckedModel, UsageError, check_device, printable, short
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import check_zeta
 from magrl.files import read_document
@@ -115,11 +114,7 @@ class RunConfig(CheckedModel):
     @model_validator(mode="after")
     def _available(self) -> Self:
         check_logger(self.logger, self.wandb_mode)
-        try:
-            torch.zeros(1, device=self.device).item()
-        except (RuntimeError, AssertionError) as error:
-            problem = f"device {self.device!r} cannot be used here ({str(error).splitlines()[0]})"
-            raise ValueError(f"{problem}: choose another, such as cpu") from None
+        check_device(self.device)
         try:
             scenario = self.load_scenario()
         except OSError as error:

@@ -47,15 +47,15 @@ class Flights(Track):
         """Return a track of the benchmark with other options, or one that these options declare."""
         return cls(**(asdict(TRACKS[track]) if track else {}) | options)
 
-    def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
+    def fly(self, navigator: Spec, errors: Errors, device: str = "cpu") -> TensorDictBase:
         """Return an episode of each task."""
         own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
         options = {key: None if own[key] == OWN_MODEL else own[key] for key in OWN_OPTIONS if key in own}
-        return flown(self.flight(errors, **options), {key: own[key] for key in own if key not in options})
+        return flown(self.flight(errors, device=device, **options), {k: own[k] for k in own if k not in options}).cpu()
 
-    def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
+    def episodes(self, navigator: Spec, errors: Errors, device: str = "cpu") -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
-        return [episode_measures(self.fly(run, errors)) for run in runs_of(navigator)]
+        return [episode_measures(self.fly(run, errors, device)) for run in runs_of(navigator)]
 
     def summaries(self, navigator: Spec, errors: Errors) -> list[dict[str, float]]:
         """Return the summary of each run of a navigator."""

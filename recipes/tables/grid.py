@@ -50,6 +50,7 @@ def flights(
     against: Sequence[Spec] = (),
     measures: Sequence[str] = MEASURES,
     jobs: int = 1,
+    device: str = "cpu",
     **options: Any,
 ) -> Table:
     """Return a row for each navigator, and a column for each level of noise, or each of some conditions.
@@ -68,7 +69,7 @@ def flights(
         label, _, given = names(navigator)
         return f"{label} ({given})" if labels.count(label) > 1 else label
 
-    cells = mapped(partial(episodes_of, options), list(itertools.product(navigators, made.errors)), jobs)
+    cells = mapped(partial(episodes_of, options, device), list(itertools.product(navigators, made.errors)), jobs)
     for navigator in navigators:
         name = title(navigator)
         episodes = {level: next(cells) for level in made.errors}
@@ -84,10 +85,10 @@ def flights(
     return Table(markdown_table([*ABOUT, *made.errors], rows), tables)
 
 
-def episodes_of(options: Mapping[str, Any], chosen: tuple[Spec, str]) -> list[Measures]:
+def episodes_of(options: Mapping[str, Any], device: str, chosen: tuple[Spec, str]) -> list[Measures]:
     """Return the episodes of a navigator at one level of errors, once for each run."""
     (navigator, level), made = chosen, Flights.of(**options)
-    return made.episodes(navigator, made.errors[level])
+    return made.episodes(navigator, made.errors[level], device)
 
 
 def mapped(function: Callable[[Any], Any], values: Sequence[Any], jobs: int) -> Iterator[Any]:
@@ -126,6 +127,7 @@ def make(
     tasks: int | None = None,
     confidence: float | None = None,
     jobs: int | None = None,
+    device: str | None = None,
     out: Path | None = None,
 ) -> None:
     """Make tables.
@@ -136,12 +138,14 @@ def make(
         tasks: Number of tasks in place of that of the table.
         confidence: Minimum probability at which vehicles declare their arrival, in place of that of the table.
         jobs: Processes that fly, with one thread each; of tables of the kind flights.
+        device: Device of the flights: cpu, cuda, cuda:0, ...
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
-    specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence, "jobs": jobs}
+    specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence}
+    changes |= {"jobs": jobs, "device": device}
     changes = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in tables if name not in specs]:
         raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(specs)}")
