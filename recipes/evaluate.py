@@ -36,8 +36,8 @@ from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.navigators import check_distinct, label, training_settings
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
-from magrl.evaluation.tables import comparison_table
-from magrl.files import check_writable, read_text, write_json, write_text, write_with
+from magrl.evaluation.tables import comparison_table, short_table
+from magrl.files import check_writable, write_json, write_text, write_with
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
@@ -68,32 +68,27 @@ class Config(ScenarioOptions):
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: anywhere, memory, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa;
-    trained agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN, memory=RUN; policies of any
-    algorithm by file: FILE, or policy:LABEL=FILE with a label."""
+    """Navigators: anywhere, memory, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa.
+    Trained agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN, memory=RUN.
+    Policies of any algorithm by file: FILE, or policy:LABEL=FILE with a label."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
     """Seed of random tasks, disjoint from the tasks of trainings and of frozen sets; 0 by default."""
     scenario: Path | None = None
-    """Scenario file (.toml or .json) of region, date and tasks (docs/data.md); by default that of the runs, or
-    the paper's."""
+    """Scenario file (.toml or .json) of region, date and tasks (docs/data.md); by default the runs' or the paper's."""
     export: Path | None = None
     """GeoJSON file for the tracks of all episodes (.geojson)."""
     errors: Noise | str | None = None
-    """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
-    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (.toml or .json,
-    docs/results.md); by default the noise of the runs, or 0."""
+    """White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle.
+    Vehicles are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (docs/results.md).
+    By default the noise of the runs, or 0."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone). A boat and
-    a drone have a compass in any case."""
+    """North of the vehicles: true (they measure D), or magnetic (I and B_H alone), as for boat and drone."""
     model: str | None = None
-    """Model of the Earth that vehicles carry, as of the date of the scenario: IGRF-14, IGRF-13, IGRF-2005, ...; none by
-    default."""
+    """Model of the Earth that vehicles carry, of the date: IGRF-14, IGRF-13, IGRF-2005, ...; none by default."""
     start_km: float | None = None
     """Error of the start as vehicles know it, with a model [km]; by default they do not know their start."""
-    kilometers: bool = False
-    """Distances in the first columns of the tables; always on with another --arrival than objective."""
     confidence: float = 0.0
     """Minimum probability of a correct declaration, with --arrival declared; 0 by default."""
     seed: int = 0
@@ -173,8 +168,8 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
     return config, flights, navigators, notes
 
 
-def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
-    """Fly every navigator, write the results and return the summaries by navigator.
+def evaluate(config: Config) -> str:
+    """Fly every navigator, write the results and return the main measures as a table, with notes below it.
 
     Raises:
         UsageError: for anything that is wrong with the settings, before anything is flown.
@@ -202,8 +197,9 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         if number == 0:
             results.rollouts[label(name)] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, example_flight.fly(example).cpu())
-    write(config, flight, results, notes)
-    return results.summaries
+    below = text_below(config, flight, notes)
+    write(config, flight, results, below)
+    return short_table(results.summaries) + below
 
 
 def settings(config: Config, flight: Flight) -> dict[str, Any]:
@@ -246,8 +242,8 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
     return told + "".join(f"\nNote: {note}.\n" for note in notes)
 
 
-def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]) -> None:
-    """Write the files of the results."""
+def write(config: Config, flight: Flight, results: Results, below: str) -> None:
+    """Write the files of the results; the text below is that of the table."""
     env = flight.base.to("cpu")
     for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
         text = io.StringIO()
@@ -257,9 +253,8 @@ def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]
         write_text(config.out / f"{name}.csv", text.getvalue())
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, flight))
-    ahead = config.kilometers or env.arrival.rule != "objective"
-    whole = comparison_table(results.summaries, published=not config.scenario, kilometers=ahead)
-    write_text(config.out / "table.md", whole + text_below(config, flight, notes))
+    whole = comparison_table(results.summaries, published=not config.scenario)
+    write_text(config.out / "table.md", whole + below)
     figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
     write_with(config.out / "trajectories.png", figure.savefig, dpi=120)
     if config.export:
@@ -269,8 +264,7 @@ def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate and print the table."""
     config = parse(Config, RECIPE, __doc__, args)
-    evaluate(config)
-    print(read_text(config.out / "table.md"), f"Results are in {config.out}", sep="\n")
+    print(evaluate(config), f"Results, and a table of all measures, are in {config.out}", sep="\n")
 
 
 if __name__ == "__main__":

@@ -59,15 +59,12 @@ class Config:
     destination: tyro.conf.Positional[str]
     """Destination, such as a start, or by its magnetic elements: "D=-11.1 I=75.2 BH=13000" (deg, deg, nT)."""
     navigator: str = "anywhere"
-    """Navigator: anywhere (the pretrained agent), anywhere=RUN (a run folder), kalman, secant, or another one of
-    recipes/evaluate.py."""
+    """Navigator: anywhere (pretrained), anywhere=RUN (a run folder), kalman, secant, ..., as in evaluate.py."""
     errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
-    """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
-    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (.toml or .json,
-    docs/results.md)."""
+    """White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle.
+    Vehicles are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (docs/results.md)."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone). A boat and a
-    drone have a compass in any case."""
+    """North of the vehicle: true (it measures D), or magnetic (I and B_H alone), as for boat and drone."""
     model: str | None = None
     """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
     start_km: float | None = None

@@ -30,8 +30,7 @@ class ScenarioOptions:
     start_heading: Literal["north", "random"] | None = None
     """Heading at the start of an episode; by default that of the runs, or north."""
     arrival: Literal["objective", "distance", "declared"] | None = None
-    """Rule of arrival: F below --zeta, the distance below --radius-km, or a declaration by the navigator's own
-    estimate; objective by default."""
+    """Rule of arrival: F below --zeta (default), distance below --radius-km, or a declaration by the navigator."""
     radius_km: float | None = None
     """Arrival radius around the destination, for --arrival distance and declared [km]; 25 by default."""
     max_steps: int | None = None

@@ -34,28 +34,17 @@ COLUMNS = {
     "path efficiency %": ("path_efficiency", ".2f"),
     "NE km": ("navigation_error_km", ".1f"),
     "within 10 km %": ("success_rate_within_10km", ".1f"),
+    "within 25 km %": ("success_rate_within_25km", ".1f"),
+    "final distance, median km": ("final_distance_km_median", ".1f"),
+    "false arrivals %": ("false_arrival_rate", ".1f"),
     "smoothness °": ("smoothness_deg", ".1f"),
     "MAE °": ("heading_mae_deg", ".1f"),
     "readings": ("field_readings", ".0f"),
 }
 """Heading, measure of :func:`cell` and number format of :func:`comparison_table`; the first four are the paper's."""
 
-SHORT_COLUMNS = {
-    "SR %": ("success_rate", ".1f"),
-    "SPL %": ("spl", ".1f"),
-    "worst run, SPL %": ("worst", ".1f"),
-    "TNT steps": ("steps", ".1f"),
-    "NE km": ("navigation_error_km", ".1f"),
-}
-"""The same of :func:`short_table`."""
-
-KILOMETERS = {
-    "within 25 km %": ("success_rate_within_25km", ".1f"),
-    "final distance, median km": ("final_distance_km_median", ".1f"),
-    "false arrivals %": ("false_arrival_rate", ".1f"),
-}
-"""Distance columns, first in some tables: over long distances, the objective hides the final distance. False arrivals
-are shown where vehicles declare their arrival."""
+SHORT_COLUMNS = ("SR %", "SPL %", "TNT steps", "NE km", "false arrivals %")
+"""Headings of :func:`short_table`."""
 
 INTERVALS = ("success_rate", "spl", "path_efficiency", "steps")
 """Measures that are shown with an interval."""
@@ -126,13 +115,12 @@ def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> 
     return "\n".join([row(*head), "|---" * len(head) + "|", *(row(*cells) for cells in rows)])
 
 
-def comparison_table(summaries: Summaries, *, published: bool = True, kilometers: bool = False) -> str:
+def comparison_table(summaries: Summaries, *, published: bool = True) -> str:
     """Return the paper's Table 2 and further measures for navigators, below the paper's own rows.
 
     Args:
         summaries: by navigator, one summary for each run, with ``field_readings``.
         published: whether the paper's rows are shown; they are of its own region.
-        kilometers: whether the columns of :data:`KILOMETERS` come first.
 
     Raises:
         ValueError: for an unknown navigator.
@@ -140,18 +128,17 @@ def comparison_table(summaries: Summaries, *, published: bool = True, kilometers
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
-        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — |
+        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — | — | — |
     """
     rows, shown = list[list[object]](), set[str]()
-    columns = _kilometers(summaries, kilometers) | COLUMNS
     for name, results in summaries.items():
         base = parse_navigator(name).name
         if published and base in paper.TABLE_2 and base not in shown:
             shown.add(base)
             published_row = [paper.TABLE_2[base]._asdict()]
-            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", "—", 1, *_cells(published_row, columns)])
-        rows.append([*about(name), len(results), *_cells(results, columns)])
-    return markdown_table([*ABOUT, "runs", *columns], rows) + "\n"
+            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", "—", 1, *_cells(published_row)])
+        rows.append([*about(name), len(results), *_cells(results)])
+    return markdown_table([*ABOUT, "runs", *COLUMNS], rows) + "\n"
 
 
 def about(name: str) -> list[str]:
@@ -167,15 +154,8 @@ def about(name: str) -> list[str]:
     return [label(name), trained_on(name), needs(name)]
 
 
-def _kilometers(summaries: Summaries, wanted: bool) -> dict[str, tuple[str, str]]:
-    """Return the columns of :data:`KILOMETERS`, as far as they are wanted and known."""
-    declared = any("false_arrival_rate" in run for runs in summaries.values() for run in runs)
-    shown = KILOMETERS if wanted else {}
-    return {head: column for head, column in shown.items() if declared or column[0] != "false_arrival_rate"}
-
-
-def _cells(results: Sequence[Summary], columns: Mapping[str, tuple[str, str]]) -> list[str]:
-    return [cell(results, key, form) for key, form in columns.values()]
+def _cells(results: Sequence[Summary], heads: Iterable[str] = COLUMNS) -> list[str]:
+    return [cell(results, *COLUMNS[head]) for head in heads]
 
 
 def cell(results: Sequence[Summary], key: str, form: str) -> str:
@@ -200,21 +180,19 @@ def cell(results: Sequence[Summary], key: str, form: str) -> str:
     return f"{text} ({ends[0]:{form}}–{ends[1]:{form}})" if len(results) == 1 and ends else text
 
 
-def short_table(summaries: Summaries, *, kilometers: bool = False) -> str:
-    """Return the main measures of navigators, without the paper's rows.
+def short_table(summaries: Summaries) -> str:
+    """Return the main measures of navigators in eight columns, without the paper's rows.
 
     Args:
         summaries: by navigator, one summary for each run.
-        kilometers: whether the columns of :data:`KILOMETERS` come first.
 
     Raises:
         ValueError: for an unknown navigator.
 
     Example:
-        >>> measures = {key: 1.0 for key, _ in SHORT_COLUMNS.values()}
-        >>> print(short_table({"secant": [measures]}).splitlines()[2].partition(" | 1.0")[2])
-        | 1.0 | — | 1.0 | 1.0 |
+        >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
+        >>> print(short_table({"secant": [measures]}).splitlines()[2])
+        | secant (quasi-Newton) | nothing | 1 | 1.0 | 1.00 | 1.00 | 1.0 | 1.0 |
     """
-    columns = _kilometers(summaries, kilometers) | SHORT_COLUMNS
-    rows = [[*about(name), *_cells(results, columns)] for name, results in summaries.items()]
-    return markdown_table([*ABOUT, *columns], rows) + "\n"
+    rows = [[label(name), needs(name), len(runs), *_cells(runs, SHORT_COLUMNS)] for name, runs in summaries.items()]
+    return markdown_table(["navigator", "given", "runs", *SHORT_COLUMNS], rows) + "\n"

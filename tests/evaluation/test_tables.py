@@ -53,8 +53,6 @@ def test_rows_of_one_and_of_several_runs() -> None:
     assert [row["worst run, SPL %"] for row in rows] == ["—", "97.00", "—"]
     assert [row["SR %"] for row in rows] == ["97.0", "100.0 [100.0–100.0]", "100.0 (99.6–100.0)"]
     assert [row["smoothness °"] for row in rows] == ["—", "170.0", "170.0"]
-    head, _, guided, _ = short_table({"gg_td3": several, "secant": [one]}).splitlines()
-    assert cells(guided)[3:6] == ["100.0 [100.0–100.0]", "98.5 [97.0–100.0]", "97.0"]
     with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
         comparison_table({"dowsing": [one]})
 
@@ -64,13 +62,11 @@ def test_papers_row_stands_above_the_algorithm() -> None:
     assert [cells(line)[0] for line in lines[2:4]] == ["GA, paper", "GA, look-ahead (an oracle)"]
 
 
-def test_columns_of_kilometers_come_first() -> None:
+def test_short_table_has_eight_columns_and_no_row_of_the_paper() -> None:
     """False arrivals are shown where vehicles declare their arrival."""
-    run = {"spl": 90.0, "success_rate_within_25km": 95.0, "final_distance_km_median": 8.0}
-    head, _, row = short_table({"secant": [run]}, kilometers=True).splitlines()
-    assert cells(head)[3:6] == ["within 25 km %", "final distance, median km", "SR %"]
-    assert cells(row)[3:5] == ["95.0", "8.0"]
-    declared = comparison_table({"secant": [run | {"false_arrival_rate": 1.5}]}, kilometers=True).splitlines()
-    assert cells(declared[0])[4:7] == ["within 25 km %", "final distance, median km", "false arrivals %"]
-    assert cells(declared[2])[6] == "1.5"
-    assert "paper" not in comparison_table({"ga": [run]}, published=False)
+    runs = {"success_rate": 90.0, "spl": 80.0, "steps": 9.0, "navigation_error_km": 8.0}
+    lines = short_table({"ga": [runs] * 2, "kalman": [runs | {"false_arrival_rate": 1.5}]}).splitlines()
+    assert cells(lines[0]) == ["navigator", "given", "runs", "SR %", "SPL %", "TNT steps", "NE km", "false arrivals %"]
+    assert cells(lines[2])[2:5] == ["2", "90.0 [90.0–90.0]", "80.00 [80.00–80.00]"]
+    assert [cells(line)[-1] for line in lines[2:]] == ["—", "1.5"]
+    assert "paper" not in comparison_table({"ga": [runs]}, published=False)

@@ -135,6 +135,16 @@ def help_text(script: str) -> str:
     return shown.getvalue()
 
 
+def test_help_breaks_lines_between_sentences() -> None:
+    """It keeps the lines of docstrings of options."""
+    shared = (ROOT / "magrl" / name for name in ("training/config.py", "evaluation/scenarios.py"))
+    for path in (*ROOT.glob("recipes/**/*.py"), *shared):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Options")):
+                options = [member.value.value for member in node.body[1:] if isinstance(member, ast.Expr)]
+                assert [text for text in options if not all(line.endswith(".") for line in text.splitlines())] == []
+
+
 def commands(text: str) -> list[list[str]]:
     """Return the commands of shell blocks and of code in a text as words, without comments and what a loop adds."""
     lines = [line for language, code in BLOCK.findall(text) if language == "sh" for line in code.splitlines()]
