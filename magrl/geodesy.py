@@ -1,4 +1,4 @@
-"""Positions, moves, distances and bearings on the WGS84 ellipsoid.
+"""Positions, legs, distances and bearings on the WGS84 ellipsoid.
 
 Latitudes and longitudes are geodetic and in degrees, distances in kilometers, headings and bearings in
 radians clockwise from true north. Every function is pure, batched by broadcasting, and smooth across the
@@ -35,10 +35,10 @@ REFERENCE_RADIUS_KM = 6371.2
 
 
 def displaced(distance: Tensor, heading: Tensor, error: Tensor) -> Tensor:
-    """Return the displacement of a move with an error.
+    """Return the displacement of a leg with an error.
 
     Args:
-        distance: ``(...)`` distance of the move [km].
+        distance: ``(...)`` distance of the leg [km].
         heading: ``(...)`` its heading [rad, clockwise from true north].
         error: ``(..., 2)`` what is added to it, northward and eastward [km].
 
@@ -97,7 +97,7 @@ def steer(
         heading: ``(...)`` present heading [rad].
         wanted: ``(...)`` heading to move at [rad].
         distance_km: ``(...)`` distance to move [km].
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Returns:
@@ -220,7 +220,7 @@ def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
 
 
 def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the end of a short move at a heading (Eq. 2-3 on the ellipsoid).
+    """Return the end of a short leg at a heading (Eq. 2-3 on the ellipsoid).
 
     The path is the circle that osculates the geodesic at its start, with Euler's radius for that heading. It is
     within 5 mm of the geodesic at 50 km and within 5 m at 500 km, and works at the poles and across the
@@ -261,7 +261,7 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
 
 
 def move_place(place: Tensor, heading: Tensor, distance_km: Tensor) -> Tensor:
-    """Return the ends ``(..., 2)`` latitude, longitude [deg] of moves from places ``(..., 2)``; see :func:`move`.
+    """Return the ends ``(..., 2)`` latitude, longitude [deg] of legs from places ``(..., 2)``; see :func:`move`.
 
     Example:
         >>> move_place(torch.tensor([0.0, 0.0]), torch.tensor(0.0), torch.tensor(110.574)).round(decimals=3)

@@ -103,11 +103,11 @@ def proximity_reward(
 ) -> Tensor:
     """Return the reward of Eq. 3-5: ``weight`` times the decrease of the objective in a step.
 
-    F has no upper bound: far from the destination, the reward of one move exceeds that of the arrival many times.
+    F has no upper bound: far from the destination, the reward of one leg exceeds that of the arrival many times.
 
     Args:
-        objective_before: ``(...)`` F before the move.
-        objective_after: ``(...)`` F after the move.
+        objective_before: ``(...)`` F before the leg.
+        objective_after: ``(...)`` F after the leg.
         weight: zeta_2.
         limit: where F is greater, it counts as this; None for the paper's equation.
 
@@ -137,7 +137,7 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
 
     Args:
         proximity: ``(...)`` from :func:`proximity_reward`.
-        step: ``(...)`` number of the move, counted from 1.
+        step: ``(...)`` number of the leg, counted from 1.
         max_steps: step limit n_max.
 
     Returns:
@@ -160,8 +160,8 @@ def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: fl
     """Return the alignment reward of Eq. 3-6: high where an angle is close to a reference.
 
     Args:
-        angle: ``(...)`` heading of the move just made [rad].
-        reference: ``(...)`` theoretical heading before the move [rad].
+        angle: ``(...)`` heading of the leg just made [rad].
+        reference: ``(...)`` theoretical heading before the leg [rad].
         weight: zeta_3 [1/rad].
         offset: deviation at which the term changes sign [rad]. With the paper's pi/4 an aligned vehicle is rewarded for
             every step; with 0 the term is never positive.

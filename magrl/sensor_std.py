@@ -29,7 +29,7 @@ class SensorStd(NamedTuple):
     Args:
         noise: of errors that are new in each reading.
         bias: of all others. Infinite for D: the vehicle has no true north, and its headings are from magnetic north.
-        drift: of those that vary along the way or with the heading; at most ``bias``.
+        drift: of those that vary along the path or with the heading; at most ``bias``.
         iron: of the part of them that is a constant field in the vehicle's axes: forward, right, down [nT].
 
     Example:

@@ -99,7 +99,7 @@ class Watched(TensorDictModuleBase):
         self.bar = tqdm(total=distance_km, bar_format=form, mininterval=0.2)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Show the distance flown, and the estimated remaining way with its standard deviation."""
+        """Show the distance flown, and the estimated remaining displacement with its standard deviation."""
         way = Way(**tensordict["track", "way"][0].double())
         left = way.displacement.norm()
         direction = way.displacement / left.clamp_min(1e-6)
@@ -176,7 +176,7 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
 
 
 def with_estimates(flight: Flight) -> TransformedEnv:
-    """Return the environment of a flight with estimates of the way."""
+    """Return the environment of a flight with estimates of the displacement."""
     track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
     return TransformedEnv(flight.env, track, auto_unwrap=True)
 

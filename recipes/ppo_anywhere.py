@@ -1,11 +1,11 @@
-"""PPO without a map: train on random planets an agent that finds its way on Earth by the estimates of its own track.
+"""PPO without a map: train on random planets an agent that navigates the Earth by the estimates of its own track.
 
     python recipes/ppo_anywhere.py                  # preset far: destinations 150-1800 km away
     python recipes/ppo_anywhere.py --preset fast    # destinations 300-500 km away
     python recipes/ppo_anywhere.py --arrival declared --max-steps 80 --price-range 0.01 0.1
     python recipes/ppo_anywhere.py --resume RUN     # resume an interrupted run exactly
 
-The agent corrects the move that dual control plans, so that it begins as the navigator `kalman`. The regions are
+The agent corrects the leg that dual control plans, so that it begins as the navigator `kalman`. The regions are
 patches of planets whose magnetic fields share only the spectrum and the polarity of the Earth's. The
 errors of the sensors and the price of a step are drawn for each episode. The test tasks are on Earth, in regions that
 no training sees. With --arrival declared, vehicles declare their arrival by the rule of `DeclareArrival`, and a false
@@ -81,7 +81,7 @@ class Config(PlanetConfig):
     radius_km: Positive = 25.0
     """Distance from the destination within which a declaration is correct [km]."""
     range_km: Positive = RANGE_KM
-    """Prior standard deviation of the way to the destination along each axis [km]."""
+    """Prior standard deviation of the displacement to the destination along each axis [km]."""
     price_range: Rising = (0.1, 30.0)
     """Range of the step price [% of SPL], which is drawn for each episode and observed by the agent."""
     critic_batches: Count = 3
@@ -129,7 +129,7 @@ def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config
 
 
 def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> TensorDictSequential:
-    """Return the actor of the training: normal corrections around those of ``actor``, and the moves that follow."""
+    """Return the actor of the training: normal corrections around those of ``actor``, and the legs that follow."""
     network, corrected_move = actor.module
     drawn = make_drawn_correction(TensorDictModule(network.module, ["observation"], ["mean"]), spread)
     return TensorDictSequential(drawn, corrected_move)
@@ -158,7 +158,7 @@ def train(config: Config) -> dict[str, float]:
         test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, config, **options)
         env, rules = make_env(base, config), rules_of(base, config)
 
-        # Networks: the critic also reads the true way and the SPL that can still be reached, the actor never does
+        # Networks: only the critic reads the true displacement and the SPL that can still be reached
         network = correction_network(config.num_cells, env.device)
         actor = make_correcting_actor(network, rules)
         spread = Spread(config.exploration).to(env.device)

@@ -165,7 +165,7 @@ def train(config: Config) -> dict[str, float]:
         earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
         test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, paper.TEST_SEED, config)
 
-        # Networks: the critic reads the true way and the SPL that can still be reached, the actor never does
+        # Networks: only the critic reads the true displacement and the SPL that can still be reached
         network, spread = MemoryNetwork(config.memory_size, config.device), Spread(config.exploration).to(env.device)
         memory = make_memory(network)
         mean = TensorDictModule(Joined(network.correct), list(KNOWN), ["mean"])

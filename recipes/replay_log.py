@@ -155,7 +155,7 @@ def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.Dat
 
 
 def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with the true way to the destination and the error of the estimate, where both are known."""
+    """Return the table with the true displacement and the error of the estimate, where both are known."""
     if "latitude" not in table or (config.target is not None and config.target_position is None):
         return table
     place = torch.tensor(table[["latitude", "longitude"]].to_numpy(dtype=float))
@@ -185,7 +185,7 @@ def last_way(table: pd.DataFrame) -> Way:
 def places(table: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     """Return positions from the start ``(T, 2)``, northward and eastward [km], and the turn of north ``(T,)`` [rad].
 
-    From true positions, where the log has them, else by dead reckoning, without the turn of north along the way.
+    From true positions, where the log has them, else by dead reckoning, without the turn of north along the path.
     """
     if "latitude" in table:
         place = torch.tensor(table[["latitude", "longitude"]].to_numpy(dtype=float))
@@ -275,7 +275,7 @@ def notes(table: pd.DataFrame) -> list[str]:
         lines.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
     if "miss_km" in table:
         halfway, end = table[["miss_km", "error_km"]].iloc[[len(table) // 2, -1]].to_numpy(float)
-        text = "Error of the estimated way {}: {:.1f} km; stated {:.1f} km.".format
+        text = "Error of the estimated displacement {}: {:.1f} km; stated {:.1f} km.".format
         lines += [text("halfway", *halfway), text("at the end", *end)]
     return [*lines, f"The destination is estimated to {last_way(table).ellipse()}."]
 

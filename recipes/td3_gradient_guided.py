@@ -65,7 +65,7 @@ class Config(RunConfig):
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode."""
     distance_cost: NonNegative = 0.0
-    """Cost of a move [1/km]; 0.1 in presets fast and nogo, none in the paper."""
+    """Cost of a leg [1/km]; 0.1 in presets fast and nogo, none in the paper."""
     objective_limit: Positive | None = None
     """Upper bound on the objective in the proximity reward; 10 in preset paper."""
     time_limit_ends: bool = False

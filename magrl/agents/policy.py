@@ -149,7 +149,7 @@ class FieldPolicy(Navigator):
         return self.act.denormalize("action", action)
 
     def check_fits(self, env: EnvBase) -> None:
-        """Raise unless an environment has the field of the policy, and allows its moves and turns.
+        """Raise unless an environment has the field of the policy, and allows its legs and turns.
 
         Raises:
             ValueError: naming the element and both ranges, or both limits.
@@ -167,7 +167,7 @@ class FieldPolicy(Navigator):
         )
         if move > longest or turn > largest:
             raise ValueError(
-                f"the policy was trained for moves up to {move:g} km and turns up to {turn:g}°, the environment allows "
+                f"the policy was trained for legs up to {move:g} km and turns up to {turn:g}°, the environment allows "
                 f"{longest:g} km and {largest:g}°: evaluate with max_move_km={move:g} and max_turn_deg={turn:g}, or "
                 "train one for these limits"
             )

@@ -193,7 +193,7 @@ class SoftUpdate(TorchRLSoftUpdate):
 def saturation_penalty(logits: Tensor) -> Tensor:
     """Return the mean square of the actor's outputs before the tanh.
 
-    Early in training every move is a loss on average, whatever its direction. An actor that follows this gradient far
+    Early in training every leg is a loss on average, whatever its direction. An actor that follows this gradient far
     into the saturation of the tanh stands still and has no gradient left. A small weight on this term prevents that.
 
     Args:

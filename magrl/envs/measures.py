@@ -56,7 +56,7 @@ def path_efficiency(straight_km: Tensor, length_km: Tensor) -> Tensor:
         tensor([0.7500,    nan])
     """
     check_tensor(straight_km=straight_km, length_km=length_km)
-    efficiency = straight_km / torch.maximum(straight_km, length_km)  # moves are geodesics only within millimeters
+    efficiency = straight_km / torch.maximum(straight_km, length_km)  # legs are geodesics only within millimeters
     return torch.where(length_km == 0, math.nan, efficiency)
 
 

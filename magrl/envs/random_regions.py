@@ -99,7 +99,7 @@ def region_scenario(
         max_latitude: latitude that no region crosses, north or south [deg].
         min_intensity_nt: lowest B_H in a region [nT].
         margin_deg: how far beyond its region a vehicle may stray before it is lost [deg].
-        max_move_km: longest move of the environment; the field ends one move beyond the margin.
+        max_move_km: longest leg of the environment; the field ends one leg beyond the margin.
         degree: degree of the expansions of the field; by default as high as the tolerance requires, from 12 on, or from
             52 on for a field of degree 133.
         tolerance_nt: largest error of the expansions [nT].

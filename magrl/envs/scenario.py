@@ -62,7 +62,7 @@ class Arrival(NamedTuple):
     Args:
         rule: ``"objective"``: an episode ends where the objective F is below ``zeta``, which is a success.
             ``"distance"``: it ends within ``radius_km`` of the destination, which is a success. ``"declared"``: it ends
-            with a move whose third number is above 0, by which the vehicle declares that it has arrived. That is a
+            with a leg whose third number is above 0, by which the vehicle declares that it has arrived. That is a
             success within ``radius_km`` of the destination, and a false arrival elsewhere.
         zeta: arrival threshold on the objective.
         radius_km: largest distance from the destination of an arrival, or of a correct declaration [km].
@@ -221,15 +221,15 @@ class Scenario(CheckedModel):
     max_steps: Annotated[int, Field(ge=1, le=10**9)] = 50
     """Moves after which an episode is truncated."""
     max_move_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
-    """Longest move [km]."""
+    """Longest leg [km]."""
     max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """Largest turn to either side before a move [deg]."""
+    """Largest turn to either side before a leg [deg]."""
     zeta: Annotated[float, AfterValidator(check_zeta)] = 0.01
     """Arrival threshold on the objective, below 3, its largest value at the start."""
     arrival: Literal["objective", "distance", "declared"] = "objective"
     """Rule of arrival: the paper's, F below ``zeta``; a distance to the destination below ``radius_km``; or
     ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has arrived with
-    this move, which ends the episode."""
+    this leg, which ends the episode."""
     radius_km: Annotated[float, Field(gt=0)] = 25.0
     """Distance from the destination of an arrival by distance, or of a correct declaration [km]."""
     start_heading: Literal["north", "random"] = "north"
@@ -283,7 +283,7 @@ class Scenario(CheckedModel):
         return self.region.expanded(self.margin_deg)
 
     def reachable(self, drift_km: float = 0.0) -> Regions:
-        """Return every place that a vehicle can reach: one move beyond the edge, rounded up to half a degree.
+        """Return every place that a vehicle can reach: one leg beyond the edge, rounded up to half a degree.
 
         Args:
             drift_km: how much farther than its command an error of motion may carry a vehicle [km].

@@ -35,7 +35,7 @@ class Limits(NamedTuple):
 
     Args:
         field: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         num_regions: number of regions.
         declared: whether vehicles declare their arrival.
@@ -55,13 +55,13 @@ class Limits(NamedTuple):
 
     @property
     def move(self) -> Bounded:
-        """Spec of a move: distance [km] and turn [rad]."""
+        """Spec of a leg: distance [km] and turn [rad]."""
         highest = torch.tensor((self.max_move_km, self.max_turn_rad), dtype=torch.float32)
         return float_bounds(highest * torch.tensor((0, -1)), highest)
 
     @property
     def displacement(self) -> Bounded:
-        """Spec of a displacement from the end of a commanded move to that of a true one [km]."""
+        """Spec of a displacement from the end of a commanded leg to that of a true one [km]."""
         reach = 2 * self.max_move_km + self.drift_km
         return Bounded(-reach, reach, (2,), dtype=torch.float64)
 

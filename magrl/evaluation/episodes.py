@@ -1,6 +1,6 @@
 """Episodes of an evaluation: rollouts, the measures of each episode, their summary, and confidence intervals.
 
-Every measure is computed from positions, moves and flags of the environment, never from a shaped reward. Angles are in
+Every measure is computed from positions, legs and flags of the environment, never from a shaped reward. Angles are in
 degrees and distances in kilometers.
 """
 
@@ -151,7 +151,7 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     Returns:
         Tensors ``(M,)``: ``success`` bool; ``steps``; ``shortest_km``, ``length_km``, ``navigation_error_km``, ``spl``
         and ``path_efficiency`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior
-        angle at way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``,
+        angle at waypoints (180 is straight, NaN without waypoints); ``heading_mae_deg`` and ``heading_rmse_deg``,
         deviations from the bearing to the destination over the legs of nonzero length (NaN without any). Where vehicles
         declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
 

@@ -1,6 +1,6 @@
 """Export of episodes as tracks for maps: GeoJSON.
 
-The vertices of a track are the way-points of the vehicle, at most 50 km apart, so that straight lines on a map deviate
+The vertices of a track are the waypoints of the vehicle, at most 50 km apart, so that straight lines on a map deviate
 from the geodesics by some hundred meters at most. Lines are cut at the antimeridian, as RFC 7946 requires.
 """
 
@@ -61,7 +61,7 @@ def feature(positions: Sequence[Position], properties: dict[str, Any]) -> Featur
     """Return a track (RFC 7946: longitude before latitude, WGS84); NaN among its properties is null.
 
     Args:
-        positions: latitude, longitude [deg] of each way-point, start first.
+        positions: latitude, longitude [deg] of each waypoint, start first.
         properties: numbers and texts by name.
 
     Example:

@@ -133,7 +133,7 @@ def compared_trajectories(
     """Return a map of the paths of several navigators on one task, over the field's contours (Fig. 4-4).
 
     Args:
-        tracks: by navigator, latitudes and longitudes of its way-points [deg].
+        tracks: by navigator, latitudes and longitudes of its waypoints [deg].
         field: any model of :mod:`magrl.field`.
         task: one task.
 
@@ -163,7 +163,7 @@ def compared_trajectories(
 
 
 def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: FieldModel, task: Tasks) -> Figure:
-    """Return D, I, B_H and the length of moves against the step (Fig. 4-5 a to d).
+    """Return D, I, B_H and the length of legs against the step (Fig. 4-5 a to d).
 
     Args:
         series: by navigator, values of ``D``, ``I``, ``B_H`` and ``L`` at each step, the start first.
@@ -183,7 +183,7 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
     """
     targets = dict(zip(NAMES, elements_at(field, task.target[0]).tolist(), strict=True))
     labels = {name: f"{SYMBOLS[name]} [{unit}]" for name, unit in zip(NAMES, UNITS, strict=True)}
-    labels["L"] = "length of the move [km]"
+    labels["L"] = "length of the leg [km]"
     figure, panels = _four_panels(labels)
     for key, axes in panels.items():
         for name, values in series.items():

@@ -124,7 +124,7 @@ class Flight:
             options: of that function.
 
         Raises:
-            ValueError: for an unknown name, or a policy of another field or of longer moves.
+            ValueError: for an unknown name, or a policy of another field or of longer legs.
         """
         if isinstance(policy, str):
             policy = make_navigator(policy, self.base, sensor_std=self.sensor_std, **{"seed": self.seed} | options)
@@ -162,7 +162,7 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
 
     Raises:
         TypeError: for a policy that is not callable, or tasks of another type.
-        ValueError: for a scenario without tasks, a policy of another field or of longer moves, or another value out of
+        ValueError: for a scenario without tasks, a policy of another field or of longer legs, or another value out of
             its range.
 
     Example:

@@ -33,13 +33,13 @@ from magrl.geodesy import geodesic, move, polar
 from magrl.tracking import Way
 
 PIECES = 4
-"""Pieces in which a move is drawn, since a geodesic is not a straight line on the map."""
+"""Pieces in which a leg is drawn, since a geodesic is not a straight line on the map."""
 LAND, ESTIMATE = "#8c6d46", "#56B4E9"
 """Colors of coastlines, and of estimates of the destination."""
 FRAME_MS, LAST_FRAME_MS, GIF_COLORS = 150, 1280, 256
 WAY = ("track", "way")
-"""Key of the estimated way of a :class:`~magrl.transforms.TrackField`."""
-_DRAWN = PIECES // 2  # a frame at every second piece of a move
+"""Key of the estimated displacement of a :class:`~magrl.transforms.TrackField`."""
+_DRAWN = PIECES // 2  # a frame at every second piece of a leg
 _FARTHEST = 1.3  # distance of an estimate, over that of the task, up to which the map of an animation holds it
 
 
@@ -107,7 +107,7 @@ def frame(positions: Tensor) -> Region:
 
 
 def episode_tracks(rollout: TensorDictBase, region: Region | Regions) -> list[Tensor]:
-    """Return the track of the first episode of each vehicle, each move in :data:`PIECES` pieces of its geodesic.
+    """Return the track of the first episode of each vehicle, each leg in :data:`PIECES` pieces of its geodesic.
 
     Args:
         rollout: ``(M, T)`` from the environment.
@@ -115,7 +115,7 @@ def episode_tracks(rollout: TensorDictBase, region: Region | Regions) -> list[Te
 
     Returns:
         ``M`` tensors ``(PIECES * steps + 1, 2)``, latitude and unwrapped longitude [deg]; every ``PIECES``-th is a
-        way-point.
+        waypoint.
 
     Raises:
         ValueError: for a rollout of other dimensions.
@@ -259,7 +259,7 @@ def estimates(states: TensorDictBase, farthest_km: float) -> Tensor:
 
 
 def _ends(position: Tensor, way: Tensor) -> Tensor:
-    """Return where ways ``(..., 2)`` northward and eastward [km] lead from positions ``(..., 2)`` [deg]."""
+    """Return where displacements ``(..., 2)`` northward and eastward [km] lead from positions ``(..., 2)`` [deg]."""
     distance, heading = polar(way.double())
     latitude, longitude = position.double().expand_as(way).unbind(-1)
     return torch.stack(move(latitude, longitude, heading, distance), -1)
@@ -270,7 +270,7 @@ def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: f
 
     Args:
         position: ``(2,)`` latitude, longitude of the vehicle [deg].
-        way: ``(2,)`` estimated way to the destination, northward and eastward [km].
+        way: ``(2,)`` estimated displacement to the destination, northward and eastward [km].
         covariance: ``(2, 2)`` its covariance [km^2].
         deviations: size of the ellipse in standard deviations.
         points: number of points.

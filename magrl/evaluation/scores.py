@@ -28,7 +28,7 @@ from magrl.navigators import NAVIGATORS
 SEED = paper.FIRST_RESERVED_SEED + 69
 """Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
 FAR_KM = 50
-"""Distance from the destination beyond which the end of a success is far [km]: the longest move of the paper."""
+"""Distance from the destination beyond which the end of a success is far [km]: the longest leg of the paper."""
 Act = Callable[[NDArray[np.float32], Any, NDArray[np.bool_]], tuple[Any, Any]]
 """From observations, state, and whether episodes start, to actions and the next state."""
 

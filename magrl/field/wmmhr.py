@@ -76,7 +76,7 @@ class WMMHR(SphericalHarmonicField):
     """The World Magnetic Model High Resolution 2025 at one date: the core, and the crust to degree 133 (300 km).
 
     In the environment, use a :class:`~magrl.field.RegionalField` of it. On 10 by 10 degrees degree 24 leaves an error
-    below 1e-4 nT; on 21 by 21 degrees, a region of that size with margin and one move, degree 40.
+    below 1e-4 nT; on 21 by 21 degrees, a region of that size with margin and one leg, degree 40.
 
     Args:
         date: ``datetime``, ISO text or decimal year, from 2025.0 to 2030.0.

@@ -4,7 +4,7 @@ Its prior is none, after two probing legs (:class:`Secant`), or a map of twelve 
 
 The filter is a Kalman filter of elements and their gradients along a dead-reckoned track, each element by itself, and
 needs no model of the field. Each element has three states, its value e at the vehicle and its gradient (g_N, g_E): a
-move by d changes the value by g·d, and a reading corrects the value and, by their covariance, the gradient. Its
+leg by d changes the value by g·d, and a reading corrects the value and, by their covariance, the gradient. Its
 functions batch over leading dimensions and take any number of elements E.
 """
 
@@ -30,7 +30,7 @@ from magrl.tracking import Way
 from magrl.tracking.local import inverse2
 
 CURVATURE = (1.5e-6, 1.8e-6, 1.2e-3)
-"""Standard deviation of the change of a gradient along the way: D, I [deg], B_H [nT], per km^2, typical of the Earth's
+"""Standard deviation of the change of a gradient along the path: D, I [deg], B_H [nT], per km^2, typical of the Earth's
 field. The error of a linear step grows with it."""
 PERIODS = (360.0, 0.0, 0.0)
 """Period of D, I [deg], B_H [nT] in readings; 0 for elements that are not wrapped."""
@@ -85,13 +85,13 @@ def first_track(reading: Tensor, prior: GradientPrior, sensor_std: Tensor) -> Fi
 def next_track(
     track: FieldTrack, displacement: Tensor, reading: Tensor, sensor_std: Tensor, curvature: Tensor, periods: Tensor
 ) -> FieldTrack:
-    """Return the state after a move and the reading at its end.
+    """Return the state after a leg and the reading at its end.
 
-    The gradient drifts with the way: with the curvature c, its variance grows by ``c^2 |d|^2``, that of the value by
+    The gradient drifts with the path: with the curvature c, its variance grows by ``c^2 |d|^2``, that of the value by
     ``c^2 |d|^4 / 4``, and their covariance by ``c^2 |d|^2 d / 2``.
 
     Args:
-        track: state before the move.
+        track: state before the leg.
         displacement: ``(..., 2)`` northward and eastward [km].
         reading: ``(..., E)``.
         sensor_std: ``(..., E)`` standard deviations of its noise.
@@ -124,12 +124,12 @@ def way_to(
     """Return the displacement to the place where the field has given values, and its covariance.
 
     It minimizes ``(r - g·d)^T S(d)^-1 (r - g·d) + |d|^2 / range^2``, with the remaining differences r and their
-    variances S(d), in three solves; the first has the mean of S over ways of the range.
+    variances S(d), in three solves; the first has the mean of S over displacements of the range.
 
     Args:
         track: state.
         target: ``(..., E)`` values at the destination.
-        range_km: prior standard deviation of the way along each axis [km].
+        range_km: prior standard deviation of the displacement along each axis [km].
         bias_std: ``(..., E)`` standard deviations of a constant error of the readings, which gradients do not have.
         curvature: ``(E,)`` see :data:`CURVATURE`: it adds ``c^2 |d|^4 / 4`` to S(d).
         periods: ``(E,)`` see :data:`PERIODS`.
@@ -172,7 +172,7 @@ def _std(reading: Tensor, sensor_std: Tensor) -> Tensor:
 
 
 RANGE_KM = 1000.0
-"""Prior standard deviation of the way to the destination along each axis [km]."""
+"""Prior standard deviation of the displacement to the destination along each axis [km]."""
 SLOW_SHARE = 0.25
 """Share of the variance of slow errors that counts as new in each reading; chosen on random planets."""
 SHORTEST_PROBE_KM = 0.5
@@ -183,9 +183,9 @@ class QuasiNewton(Navigator):
     """Base class of quasi-Newton navigators: each leg goes to where the estimated Jacobian predicts no error.
 
     The filter (:func:`next_track`) weighs each reading by its noise and the length of the leg, and each
-    element by how well it determines the way. Without noise, the first update is Broyden's. With ``search``, the way is
-    that to the most probable destination, given that the episode has not ended at the places where the vehicle has been
-    (:func:`~magrl.tracking.unvisited`).
+    element by how well it determines the displacement. Without noise, the first update is Broyden's. With ``search``,
+    the vehicle aims at the most probable destination, given that the episode has not ended at the places where it has
+    been (:func:`~magrl.tracking.unvisited`).
 
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
@@ -196,7 +196,7 @@ class QuasiNewton(Navigator):
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
-            it, the way is the estimated one.
+            it, the displacement is the estimated one.
         radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
 
     Raises:
@@ -261,7 +261,7 @@ class QuasiNewton(Navigator):
     def reading_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the present reading in the filter, of the chosen elements.
 
-        Slow errors vary along the way, which the filter would take for a gradient: a share of them is noise to it.
+        Slow errors vary along the path, which the filter would take for a gradient: a share of them is noise to it.
         """
         std = self.accuracy(seen)
         return torch.hypot(std.noise, SLOW_SHARE**0.5 * std.drift)[..., self.elements]
@@ -295,7 +295,7 @@ class QuasiNewton(Navigator):
         return self.steer(seen, aim, aim.norm(dim=-1))
 
     def aim(self, track: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
-        """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last leg."""
+        """Return the displacement ``(N, 2)`` [km] to the most probable destination; store the end of the last leg."""
         visit_place(seen, memory)
         if not self.search:
             return way.displacement
@@ -397,7 +397,7 @@ class Secant(QuasiNewton):
         max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest leg.
-        elements: all three by default, each weighted by how well it determines the way; or two of them.
+        elements: all three by default, each weighted by how well it determines the displacement; or two of them.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         **options: ``zeta`` and ``search`` of :class:`QuasiNewton`.
 

@@ -1,4 +1,4 @@
-"""Estimation of the field around a vehicle, of the way to its destination, and of its next move."""
+"""Estimation of the field around a vehicle, of the displacement to its destination, and of its next leg."""
 
 from magrl.tracking.belief import Belief as Belief
 from magrl.tracking.belief import Innovation as Innovation

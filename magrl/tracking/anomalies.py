@@ -1,7 +1,7 @@
 """Magnetic anomalies of unknown size: beliefs side by side, one for each size, weighed by how well they predict.
 
 The field of the crust, and magnetic weather that nobody stated, have a size that a vehicle does not know. So it holds a
-belief for each of some sizes. Each takes in every move and reading, and has a weight, which changes by the likelihood
+belief for each of some sizes. Each takes in every leg and reading, and has a weight, which changes by the likelihood
 of its innovations, N(r; 0, S); now and then the size changes. What the vehicle believes is their mixture, as one normal
 distribution with its moments.
 

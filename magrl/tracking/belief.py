@@ -1,15 +1,15 @@
-"""What a vehicle knows of the field around it: one normal distribution, and how moves and readings change it.
+"""What a vehicle knows of the field around it: one normal distribution, and how legs and readings change it.
 
 The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.tracking.harmonics`, the first
 three are the field itself), a magnetic anomaly, the error of the estimated place, the drift of dead reckoning, and the
 errors of the readings: constant ones of D, I, B_H, and a field that turns with the vehicle, such as that of hard iron.
-The anomaly is the field of the crust and of magnetic weather, three components that vary along the way as a first-order
-Gauss-Markov process. Where the place is not known, its error northward is that of the latitude, which is dead-reckoned
-(true north turns along the way, by tan(latitude) / R for each kilometer eastward). Where it is known, and with it a
-model of the Earth, the coefficients stay those at the true place, and a move changes them as the model does, but for
-their difference from it (:class:`Motion`). Both steps are those of a Kalman filter:
+The anomaly is the field of the crust and of magnetic weather, three components that vary along the path as a
+first-order Gauss-Markov process. Where the place is not known, its error northward is that of the latitude, which is
+dead-reckoned (true north turns along the path, by tan(latitude) / R for each kilometer eastward). Where it is known,
+and with it a model of the Earth, the coefficients stay those at the true place, and a leg changes them as the model
+does, but for their difference from it (:class:`Motion`). Both steps are those of a Kalman filter:
 
-- A move along a great circle is linear in the coefficients, c' = Turn(gamma) exp(X) c, where X = n (d_x + T_N / M) + e
+- A leg along a great circle is linear in the coefficients, c' = Turn(gamma) exp(X) c, where X = n (d_x + T_N / M) + e
   (d_y + T_E / N) has the generators of translations, with the degrees above 3 as their regression, and of the turns of
   the vertical over the radii of curvature M and N. Gamma is by how much azimuths become larger along the great circle.
 - A reading measures the field: D, I, B_H are a vector in the local axes, and their errors are carried over to it by
@@ -17,7 +17,7 @@ their difference from it (:class:`Motion`). Both steps are those of a Kalman fil
 
 A vehicle that has no north reference but its compass measures I and B_H, and its headings are from magnetic north. Its
 axes are those of magnetic north where it is: the field has no eastward part there, exactly. They are turned after each
-move by how much D has changed along it, as the belief expects; the latitude is not known (NaN) and not needed.
+leg by how much D has changed along it, as the belief expects; the latitude is not known (NaN) and not needed.
 
 All functions batch over leading dimensions.
 """
@@ -43,7 +43,7 @@ from magrl.tracking.prior import ANGLES, DEGREE, closure, expected, lasting_cova
 PLACE = slice(COEFFICIENTS, COEFFICIENTS + 2)
 """True minus estimated place, northward and eastward [km] in the state."""
 DRIFT = slice(COEFFICIENTS + 2, COEFFICIENTS + 4)
-"""Constant drift of dead reckoning, northward and eastward [share of the way] in the state."""
+"""Constant drift of dead reckoning, northward and eastward [share of the distance] in the state."""
 CONSTANT = slice(COEFFICIENTS + 4, COEFFICIENTS + 7)
 """Constant errors of D, I [deg], B_H [nT] in the state."""
 ANOMALY = slice(COEFFICIENTS + 7, COEFFICIENTS + 10)
@@ -56,7 +56,7 @@ ANOMALY_KM = 125.0
 """Correlation length of the anomaly [km]. WMMHR, degrees 14 to 133 at the ground, has .9 at 50 km, .62 at 100 km and
 .28 at 150 km; for a ship, it is four hours of magnetic weather."""
 MODEL_NT = 2.0
-"""Standard deviation of the field by what the model leaves out, in each axis [nT]: .1 to .8 after six moves of 50 km on
+"""Standard deviation of the field by what the model leaves out, in each axis [nT]: .1 to .8 after six legs of 50 km on
 random planets, and more after many."""
 
 
@@ -65,8 +65,8 @@ class Motion(NamedTuple):
 
     Args:
         model: model of the Earth; None without one.
-        drift: constant drift of dead reckoning, standard deviation along each axis as a share of the way.
-        wander_km: random part of it, standard deviation along each axis after a way of 1 km [km].
+        drift: constant drift of dead reckoning, standard deviation along each axis as a share of the displacement.
+        wander_km: random part of it, standard deviation along each axis after a distance of 1 km [km].
     """
 
     model: EarthModel | None = None
@@ -230,12 +230,12 @@ def moved(
     motion: Motion = STILL,
     crust_nt: Tensor | float = 0.0,
 ) -> Belief:
-    """Return the belief after a move, before the reading at its end.
+    """Return the belief after a leg, before the reading at its end.
 
     Args:
-        belief: that before the move.
-        distance: ``(...)`` [km], to about 200; divide longer moves.
-        course: ``(...)`` at the start of the move [rad, clockwise from north].
+        belief: that before the leg.
+        distance: ``(...)`` [km], to about 200; divide longer legs.
+        course: ``(...)`` at the start of the leg [rad, clockwise from north].
         errors: accuracy of the readings, tensors ``(..., 3)``.
         motion: errors of dead reckoning, and the model of the Earth, where the place is known.
         crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
@@ -279,10 +279,10 @@ def moved(
 def _moved_by_model(
     belief: Belief, after: Belief, matrix: Tensor, spread: Tensor, distance: Tensor, course: Tensor, motion: Motion
 ) -> Belief:
-    """Return the belief after a move where the place is known: coefficients change as those of the model do at the
+    """Return the belief after a leg where the place is known: coefficients change as those of the model do at the
     estimated place, and their difference from the model as any field does.
 
-    With the model's coefficients m and their slopes J before the move, m' and J' after it, the turn and translation M,
+    With the model's coefficients m and their slopes J before the leg, m' and J' after it, the turn and translation M,
     and the errors d of the place, c' = m' + M (c - m - J d) + J' d'.
     """
     model = motion.model

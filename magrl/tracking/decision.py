@@ -35,7 +35,7 @@ class Trip(NamedTuple):
         home: ``(..., 2)`` displacement from the start, northward and eastward [km].
         steps_left: ``(...)`` number of steps that are left after this one.
         price: ``(...)`` price of a step [% of SPL].
-        max_move_km: longest move.
+        max_move_km: longest leg.
     """
 
     path: Tensor
@@ -46,8 +46,9 @@ class Trip(NamedTuple):
 
 
 class ArrivalDecision(NamedTuple):
-    """Probability ``(...)`` of being right now, that at which going on is worth as much, the highest that more readings
-    can reach, the way ``(..., 2)`` to the estimated place, and the distance from it at which to stop for them [km].
+    """When a vehicle declares its arrival: the probability ``(...)`` of being right now, the probability at which going
+    on is worth as much, the highest that more readings can reach, the displacement ``(..., 2)`` to the estimated place,
+    and the distance from it at which to stop for them [km].
 
     Example:
         >>> ArrivalDecision(*torch.tensor([0.9, 0.8, 0.9]), torch.zeros(2), torch.tensor(10.0)).declare
@@ -72,7 +73,7 @@ def arrival_decision(
     """Return whether to declare that the destination is within a radius, or where to stop and read on.
 
     It compares what is expected of a declaration now and later, as SPL less the price of the steps, both over the SPL
-    of an arrival now. Later is after a way toward the estimated place, to one of :data:`STOPS` before it, and 1 to 32
+    of an arrival now. Later is after a leg toward the estimated place, to one of :data:`STOPS` before it, and 1 to 32
     readings there. Readings do not reduce the errors that are constant. Without steps left, going on is worth nothing.
 
     The posterior has tails that a normal forecast of it has not. Within the radius, forecasts are reduced by half of
@@ -114,7 +115,7 @@ def arrival_decision(
 
 
 def _efficiency(trip: Trip, way: Tensor, further: Tensor, readings: Tensor) -> Tensor:
-    """Return the SPL of an arrival after a further way ``(..., J)`` [km] and readings ``(K,)``, less the price of the
+    """Return the SPL of an arrival after a further path ``(..., J)`` [km] and readings ``(K,)``, less the price of the
     steps, over the SPL of an arrival now: ``(..., K, J)``."""
     straight = (trip.home.to(way) + way).norm(dim=-1).clamp_min(1.0)
     path = torch.maximum(trip.path.to(way), straight)
@@ -135,8 +136,8 @@ def approach(
     Args:
         way: ``(..., 2)`` northward and eastward [km].
         heading: ``(..., 1)`` [rad].
-        stop_km: ``(..., 1)`` distance from the place at which the move ends.
-        max_move_km: longest move.
+        stop_km: ``(..., 1)`` distance from the place at which the leg ends.
+        max_move_km: longest leg.
         max_turn_rad: largest turn.
 
     Example:

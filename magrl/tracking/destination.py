@@ -1,4 +1,4 @@
-"""Where the destination is, given its elements: the posterior of the way as weighted points.
+"""Where the destination is, given its elements: the posterior of the displacement as weighted points.
 
 At a displacement d along a great circle, the field is linear in the coefficients of a belief, H(d) c
 (:func:`~magrl.tracking.harmonics.field_rows`, with the higher degrees as their regression). It is given in axes that
@@ -30,7 +30,7 @@ from magrl.tracking.prior import DEGREE, HIGHEST, closure
 from magrl.tracking.way import DestinationPosterior, Way
 
 RANGE_KM = 400.0
-"""Default of the prior standard deviation of the way along each axis [km]."""
+"""Default of the prior standard deviation of the displacement along each axis [km]."""
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out; none is farther
 _ELSEWHERE_LOG = -39.0  # its log density: e^-7, over the volume of all fields on the Earth [nT^3]
 _SLACK_NT = 100.0  # deviation of the field at the mode within which a destination is in reach
@@ -92,7 +92,7 @@ def destination(
     Args:
         belief: what is known of the field.
         elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] at the destination.
-        range_km: prior standard deviation of the way along each axis [km].
+        range_km: prior standard deviation of the displacement along each axis [km].
         crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
         std: ``(3,)`` standard deviations of the elements; 0 by default.
@@ -152,7 +152,7 @@ def mode(goal: Destination) -> Way:
     """Return about where the posterior is largest, by Gauss-Newton steps, and the inverse of their normal matrix.
 
     The covariance of the field there counts as constant in each step. The first step has the mean covariance over the
-    prior of the way, the others that at the solution before.
+    prior of the displacement, the others that at the solution before.
 
     Example:
         >>> from magrl.sensor_std import SensorStd
@@ -186,7 +186,7 @@ def mode(goal: Destination) -> Way:
 
 
 def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
-    """Return the posterior of the way to a destination, in single precision.
+    """Return the posterior of the displacement to a destination, in single precision.
 
     A quarter of the points are around the mode, the others around the vehicle; each has the density over that of all
     points there as its weight.
@@ -384,10 +384,11 @@ def _quadratic(entries: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor
 
 
 def _points(way: Way, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return points ``(..., M, 2)`` around a way of a heading ``(..., 2)`` and around the vehicle [km], and their
-    density ``(..., M)``, unnormalized.
+    """Return points ``(..., M, 2)`` around a displacement of a heading ``(..., 2)`` and around the vehicle [km].
 
-    They are laid out along and across the way, so that they turn with it.
+    Their density ``(..., M)``, unnormalized, is the second value.
+
+    They are laid out along and across the displacement, so that they turn with it.
     """
     normal, around = (points.to(way.displacement) for points in unit_points(count))
     distance, (cos, sin) = way.displacement.norm(dim=-1), heading.unbind(-1)

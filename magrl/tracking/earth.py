@@ -52,7 +52,7 @@ class EarthModel:
         self.name, self.field, self.variance = name, field, variance
         self.error = local_covariance(variance, DEGREE)
         planets = local_covariance(gauss_moments()[2], DEGREE)
-        degree = slice(8, COEFFICIENTS)  # what changes most along a move
+        degree = slice(8, COEFFICIENTS)  # what changes most along a leg
         self.share = float(self.error.diagonal()[degree].mean() / planets.diagonal()[degree].mean())
         self._cells: dict[bool, Cells] = {}
 

@@ -1,4 +1,4 @@
-"""What readings after a move will teach of the way to the destination, before they are made."""
+"""What readings after a leg will teach of the displacement to the destination, before they are made."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from magrl.tracking.way import Way
 def covariance_after(
     goal: Destination, place: Tensor, moves: Tensor, errors: SensorStd, readings: Tensor | float = 1.0
 ) -> Tensor:
-    """Return the expected covariance of the way ``(..., M, 2, 2)`` [km^2] after moves and readings at their ends.
+    """Return the expected covariance ``(..., M, 2, 2)`` of the displacement [km^2] after legs with readings at the end.
 
     The covariance of the predicted field at a place, after a reading, does not depend on what will be read. Its slopes
     there, which divide a difference of the field, do: their mean square is that of the present estimate plus what the
@@ -81,7 +81,7 @@ def _between_after(
     reading, noise = _readings(goal, moves, errors, readings)
     covariance = goal.belief.covariance.unsqueeze(-3)
     far = moves.norm(dim=-1)[..., None, None] * UNIT_KM
-    cross = covariance[..., PLACE, :] + far * covariance[..., DRIFT, :]  # of the place after the move, (..., M, 2, S)
+    cross = covariance[..., PLACE, :] + far * covariance[..., DRIFT, :]  # of the place after the leg, (..., M, 2, S)
     now = cross[..., PLACE] + far * cross[..., DRIFT]
     target = between.covariance - goal.belief.covariance[..., PLACE, PLACE]
     shared = cross @ reading.mT
@@ -104,8 +104,8 @@ def _comparable(goal: Destination, rows: Tensor, residual: Tensor) -> tuple[Tens
 
 
 def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Return the rows ``(..., M, 3, S)`` of readings of D, I, B_H after moves [unit], and their noise
-    ``(..., M, 3, 3)``, both in the dtype of the moves."""
+    """Return the rows ``(..., M, 3, S)`` of readings of D, I, B_H after legs [unit], and their noise
+    ``(..., M, 3, 3)``, both in the dtype of the legs."""
     belief, mean = goal.belief, goal.belief.mean[..., None, :COEFFICIENTS, None].to(moves)
     noise = torch.as_tensor(errors.noise).to(moves)
     present = (noise < math.inf) & belief.measured

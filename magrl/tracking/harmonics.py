@@ -171,9 +171,10 @@ def powers(displacement: Tensor, degree: int) -> Tensor:
 
 
 class Arc(NamedTuple):
-    """A way along a great circle, each ``(...)``: cosine and sine of the angle gamma by which azimuths are larger at
-    its end than in axes that are carried along; the derivatives of gamma and of the latitude at its end with respect to
-    that at its start; and sine and cosine of the latitude at its end, the latter not below :data:`LEAST_COS`.
+    """A displacement along a great circle, each ``(...)``: cosine and sine of the angle gamma by which azimuths are
+    larger at its end than in axes that are carried along; the derivatives of gamma and of the latitude at its end with
+    respect to the latitude at its start; and sine and cosine of the latitude at its end, the latter not below
+    :data:`LEAST_COS`.
 
     Example:
         >>> Arc._fields
@@ -204,8 +205,8 @@ def arc(sin: Tensor, cos: Tensor, north: Tensor, east: Tensor) -> Arc:
     Args:
         sin: ``(...)`` sine of the latitude at the start; NaN where it is not known.
         cos: ``(...)`` its cosine.
-        north: ``(...)`` angle n of the way northward [rad], below 1.
-        east: ``(...)`` angle e of the way eastward [rad].
+        north: ``(...)`` angle n of the displacement northward [rad], below 1.
+        east: ``(...)`` angle e of the displacement eastward [rad].
 
     Example:
         >>> turn = arc(*(torch.tensor(x, dtype=torch.float64) for x in (0.8, 0.6, 0.0, 0.01)))
@@ -228,7 +229,7 @@ def field_rows(degree: int, terms: int) -> Tensor:
     """Return the field at a place on the sphere as polynomials of the displacement.
 
     A vehicle that moves along a great circle by p = (n, e), and takes its axes with it without turning them about the
-    vertical, then has the coefficients exp(n X + e Y) c, with the generators X and Y of moves of a unit north and east;
+    vertical, then has the coefficients exp(n X + e Y) c, with the generators X and Y of legs of a unit north and east;
     the first three are the field there. The exponential is expanded in monomials of n and e.
 
     Args:

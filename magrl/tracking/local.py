@@ -1,4 +1,4 @@
-"""The local coefficients of the field at a place: how they change along moves, and the field at displacements."""
+"""The local coefficients of the field at a place: how they change along legs, and the field at displacements."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def closed_derivatives() -> Tensor:
 
 
 def carry(north: Tensor, east: Tensor, *angles: Tensor) -> Tensor:
-    """Return exp(X) ``(..., K, K)`` of a move [unit] that turns the vertical by angles northward and eastward [rad], to
+    """Return exp(X) ``(..., K, K)`` of a leg [unit] that turns the vertical by angles northward and eastward [rad], to
     the fourth order."""
     steps = torch.cat((closed_derivatives(), generators(DEGREE).turn[:2])).to(north)
     matrix = torch.tensordot(torch.stack((north, east, *angles), -1), steps, 1)

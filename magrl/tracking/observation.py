@@ -30,7 +30,7 @@ def track_observation(
     """Return the observation of an agent that navigates by the estimates of its own track.
 
     All vectors are in the vehicle's frame, so that a policy generalizes over headings. Lengths are logarithms, because
-    the best move depends on their ratios.
+    the best leg depends on their ratios.
 
     Args:
         aim: ``(..., 2)`` displacement to aim at, forward and to the right [km].
@@ -44,9 +44,10 @@ def track_observation(
         price: ``(..., 1)`` price of a step [% of SPL].
 
     Returns:
-        ``(..., 19)``: direction (2) and length (2) of the way; logarithms of its standard deviations (2) and their
-        correlation; the same three of the arrival ellipse by the estimated gradient; logarithm of F over the threshold;
-        time; logarithms of the noise (3); direction (2) and logarithm of the length of the plan; that of the price.
+        ``(..., 19)``: direction (2) and length (2) of the displacement; logarithms of its standard deviations (2) and
+        their correlation; the same three of the arrival ellipse by the estimated gradient; logarithm of F over the
+        threshold; time; logarithms of the noise (3); direction (2) and logarithm of the length of the plan; logarithm
+        of the price.
 
     Example:
         >>> three, one = torch.ones(3), torch.ones(1)

@@ -1,6 +1,6 @@
 """The step of a vehicle that navigates by its own readings: a reading and a record in, a record and an action out.
 
-:func:`begin` and :func:`advance` keep the record, :func:`act` chooses the move, and all three are pure functions: the
+:func:`begin` and :func:`advance` keep the record, :func:`act` chooses the leg, and all three are pure functions: the
 same ones run in simulation, on board and in training. A step in ten lines::
 
     beliefs = moved(beliefs, distance, heading, std, motion)        # dead reckoning of the field and the place
@@ -74,7 +74,7 @@ def begin(rules: Rules, reading: Reading) -> Track:
 
 
 def advance(rules: Rules, state: State, reading: Reading) -> Track:
-    """Return the track after a move and the reading at its end.
+    """Return the track after a leg and the reading at its end.
 
     The stated noise is always scaled by what the readings show (:func:`~magrl.tracking.noise_estimate`), and a spike
     counts less (:func:`~magrl.tracking.spike_factor`).
@@ -126,7 +126,7 @@ def _first_beliefs(rules: Rules, reading: Reading) -> Belief:
 
 
 def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor, Tensor]:
-    """Return the state after a move and the reading at its end, and the surprise and tail probability of that."""
+    """Return the state after a leg and the reading at its end, and the surprise and tail probability of that."""
     one = _true(reading, state.north)
     seen, own = _side_by_side(one), NoiseEstimate(state.log_ratio, state.readings)
     std, heading, field, sizes = seen.std.noise, seen.heading, seen.field, anomalies.sizes().to(state.mean)
@@ -189,7 +189,7 @@ def position_fix(belief: Belief, place: Tensor, std_km: float) -> Innovation:
 
 
 def _leg_covariance(std: Tensor, heading: Tensor) -> Tensor:
-    """Return the covariance ``(..., 2, 2)`` northward and eastward of a move with errors along and across it."""
+    """Return the covariance ``(..., 2, 2)`` northward and eastward of a leg with errors along and across it."""
     cos, sin = torch.cos(heading.double()), torch.sin(heading.double())
     turn = torch.stack((cos, -sin, sin, cos), -1).unflatten(-1, (2, 2))
     return turn @ torch.diag_embed(std.double().square()) @ turn.mT

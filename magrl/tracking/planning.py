@@ -1,4 +1,4 @@
-"""The next move of a vehicle that navigates by its own readings, chosen for its progress and for what it will teach."""
+"""The next leg of a vehicle that navigates by its own readings, chosen for its progress and for what it will teach."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from magrl.tracking.forecast import covariance_after
 from magrl.tracking.way import DestinationPosterior
 
 CAUTION = 0.3
-"""Weight of the uncertainty of the way after a reading; this and :data:`LENGTHS` are from scans on random planets
-(docs/navigators.md)."""
+"""Weight of the uncertainty after a reading; this and :data:`LENGTHS` are from scans on random planets."""
 STEP_PRICE = 0.5
 """Default price of a step [% of SPL]."""
 CHEAP_KM = 2.0
@@ -28,26 +27,26 @@ RESERVE_SHARE = 0.2
 MISSING_KM = 1000.0
 """Accuracy [km] of a reading beyond which it is a missing one, which says nothing about the sensors."""
 NEAR_KM = 30.0
-"""Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
+"""Distance at which the uncertainty along the displacement starts to matter beside that across it [km]."""
 SLOPES = (0.004, 0.015, 4.0)
 """Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
 LENGTHS = (0.1, 0.3, 0.6, 1.0)
-"""Lengths of the moves that are compared by default; the whole way, if it is shorter, is another."""
+"""Lengths of the legs that are compared by default; the whole displacement, if it is shorter, is another."""
 SHORTEST = 1 / 40
-"""The least length of a move that is compared, as a share of the way."""
+"""The least length of a leg that is compared, as a share of the displacement."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
-"""Their directions, from that of the way [deg]."""
+"""Their directions, from that of the displacement [deg]."""
 KEPT = 40
-"""Number of the moves, those of least path and price, of which it is forecast what a reading teaches. On random
+"""Number of the legs, those of least path and price, of which it is forecast what a reading teaches. On random
 planets, all 65 do no better (docs/results/performance.md)."""
 CORRECTION = 0.5
 """Unit of the corrections of a plan: of the logarithm of the length, and of the direction [rad]."""
 
 
 def sensor_length(std: Tensor) -> Tensor:
-    """Return the way over which the elements typically change as much as the errors of a reading ``(...)`` [km].
+    """Return the distance over which the elements typically change as much as the errors of a reading ``(...)`` [km].
 
-    A position takes two elements, so that the second smallest way of the three counts.
+    A position takes two elements, so that the second smallest distance of the three counts.
 
     Args:
         std: ``(..., 3)`` standard deviations of D [deg], I [deg], B_H [nT].
@@ -69,22 +68,22 @@ def step_price(
     max_steps: int,
     max_move_km: float,
 ) -> Tensor:
-    """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
+    """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the path run out.
 
     The search at the end takes more readings where one is less accurate: as many steps are kept in reserve as readings
     whose mean is accurate to :data:`RESERVE_KM`, at most :data:`RESERVE_SHARE` of the limit. With a price p [km]
     while many are left, and r steps of the limit for each that is left beyond the reserve, it is the larger of
     ``p r^2`` and ``min(p, 2 km) r^4``: where a step is cheap, a vehicle that has used half of the limit is in search of
-    the destination, and small moves teach little.
+    the destination, and small legs teach little.
 
     Args:
         percent: price while many are left [% of SPL]: p is this share of ``range_km``.
-        range_km: way that counts as 100 % [km].
+        range_km: distance that counts as 100 % [km].
         way: ``(..., 2)`` [km].
         step: ``(...)`` number of the step.
         sensor_std: standard deviations of a reading, ``(..., 3)`` or 3 numbers.
         max_steps: step limit of the episode.
-        max_move_km: longest move.
+        max_move_km: longest leg.
 
     Example:
         >>> way = torch.tensor([100.0, 0.0])
@@ -111,25 +110,25 @@ def planned_move(
     caution: float = CAUTION,
     lengths: Sequence[float] = LENGTHS,
 ) -> Tensor:
-    """Return the displacement ``(..., 2)`` [km] of the next move, northward and eastward.
+    """Return the displacement ``(..., 2)`` [km] of the next leg, northward and eastward.
 
-    It compares moves of several lengths and directions (:data:`ANGLES_DEG`) and takes the least sum of three costs
+    It compares legs of several lengths and directions (:data:`ANGLES_DEG`) and takes the least sum of three costs
     [km]:
 
-    - the path: the length of the move plus the mean distance that then remains, over the posterior of the way;
-    - the detour that the uncertainty of the way may then cost, times ``caution``: what a reading at the end of the move
-      will teach does not depend on what will be read (:func:`~magrl.tracking.covariance_after`);
+    - the path: the length of the leg plus the mean distance that then remains, over the posterior of the displacement;
+    - the detour that the uncertainty of the displacement may then cost, times ``caution``: what a reading at the end of
+      the leg will teach does not depend on what will be read (:func:`~magrl.tracking.covariance_after`);
     - the price of the steps that remain.
 
     Args:
         goal: the destination as seen from the belief.
         posterior: its posterior.
-        aim: ``(..., 2)`` way to aim at, northward and eastward [km]; the posterior is shifted to have its mean there.
+        aim: ``(..., 2)`` northward and eastward [km]; the posterior is shifted to have its mean there.
         errors: accuracy of the next reading, tensors ``(..., 3)``.
         step_km: ``(...)`` price of a step [km], see :func:`step_price`.
-        max_move_km: longest move.
+        max_move_km: longest leg.
         caution: weight of the uncertainty.
-        lengths: of the moves that are compared, as fractions of the longest; at least :data:`SHORTEST` of the way.
+        lengths: of the legs that are compared, as fractions of the longest; at least :data:`SHORTEST` of the path.
 
     Source:
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
@@ -177,7 +176,7 @@ def corrected(way: Tensor, correction: Tensor) -> Tensor:
 
 
 def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:
-    """Return the displacements ``(..., M, 2)`` [km] that are compared, given the way ``(..., 2)``."""
+    """Return the displacements ``(..., M, 2)`` [km] that are compared, given the displacement ``(..., 2)``."""
     distance = way.norm(dim=-1, keepdim=True)
     whole, least = (x.clamp_max(max_move_km) for x in (distance, SHORTEST * distance))
     fixed = torch.maximum(way.new_tensor(lengths) * max_move_km, least)
@@ -187,10 +186,10 @@ def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:
 
 
 def _detour(left: Tensor, covariance: Tensor) -> Tensor:
-    """Return the detour ``(..., M)`` [km] for remaining ways ``(..., M, 2)`` of a covariance ``(..., M, 2, 2)``.
+    """Return the detour ``(..., M)`` [km] for remaining displacements ``(..., M, 2)``, covariance ``(..., M, 2, 2)``.
 
-    It is the hypotenuse over the way and the standard deviation across it, minus the way. Near the destination, the
-    standard deviation along the way counts as well.
+    It is the hypotenuse over the distance and the standard deviation across it, minus the distance. Near the
+    destination, the standard deviation along it counts as well.
     """
     distance = left.norm(dim=-1)
     ahead = (left / distance.clamp_min(1e-9).unsqueeze(-1)).unsqueeze(-1)

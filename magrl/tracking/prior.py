@@ -77,7 +77,7 @@ class Closure(NamedTuple):
 
     Attributes:
         extend: ``(K', K)``, the coefficients of degrees 1 to :data:`HIGHEST`, from those of 1 to N.
-        drift: ``(K, K)`` [nT^2 per unit^2], covariance of the coefficients after a move by the coefficients of degree
+        drift: ``(K, K)`` [nT^2 per unit^2], covariance of the coefficients after a leg by the coefficients of degree
             N + 1 that differ from the expected ones.
         left_out_nt: standard deviation of the field at a distance of a unit by all that differs from the expected
             [nT]; it grows with the N-th power of the distance.

@@ -27,8 +27,8 @@ class Rules(CheckedModel):
     """What a vehicle knows before it starts: its limits, the rule of arrival, and what it expects of the field.
 
     Args:
-        max_move_km: longest move [km].
-        max_turn_rad: largest turn before a move [rad].
+        max_move_km: longest leg [km].
+        max_turn_rad: largest turn before a leg [rad].
         max_steps: step limit.
         zeta: arrival threshold on the objective.
         arrival: what ends the episode: the objective or the distance, with a signal at each step, or a declaration by
@@ -45,7 +45,7 @@ class Rules(CheckedModel):
         target_km: the same of the destination's place; None where it knows the elements alone.
         target_std: standard deviations of D, I [deg], B_H [nT] with which the elements at the destination were
             measured, at its place; None where they are from the vehicle's own model, which they add nothing to.
-        drift: constant drift of dead reckoning along each axis [share of the way].
+        drift: constant drift of dead reckoning along each axis [share of the distance].
         wander_km: random part of it along each axis after 1 km [km].
 
     Raises:
@@ -102,7 +102,7 @@ class Reading(NamedTuple):
     Args:
         field: ``(..., 3)`` D [deg], I [deg], B_H [nT] as read; NaN for an element that is missing.
         target: ``(..., 3)`` the same at the destination.
-        distance: ``(...)`` of the move before the reading [km].
+        distance: ``(...)`` of the leg before the reading [km].
         heading: ``(...)`` [rad].
         std: accuracy of the reading, tensors ``(..., 3)``.
         step: ``(...)`` number of the step, 0 at the start.
@@ -111,7 +111,7 @@ class Reading(NamedTuple):
         price: ``(...)`` price of a step [% of SPL] of each vehicle; None for that of the rules.
         place: ``(..., 2)`` latitude, longitude [deg] of the start, where it is known; it counts at the first reading.
         target_place: ``(..., 2)`` the same of the destination.
-        leg_std: ``(..., 2)`` standard deviations of the move, along and across it, beside the drift of the rules [km].
+        leg_std: ``(..., 2)`` standard deviations of the leg, along and across it, beside the drift of the rules [km].
     """
 
     field: Tensor
@@ -179,7 +179,7 @@ class Track(NamedTuple):
         way: its mean and covariance [km].
         local: elements and gradients at the vehicle.
         aim: ``(..., 2)`` displacement to aim at [km]: the mean, or where it has not been.
-        plan: ``(..., 2)`` displacement of the next move as planned [km].
+        plan: ``(..., 2)`` displacement of the next leg as planned [km].
         surprise: ``(...)`` normalized square of the innovation by the stated noise, over the number of elements; about
             1 where all is right.
         tail: ``(...)`` probability of a reading that is more surprising, where everything stated is true.

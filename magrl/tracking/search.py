@@ -18,7 +18,7 @@ SEARCH_KM = 500.0
 _SOBOL = torch.quasirandom.SobolEngine(2).fast_forward(1)  # its first point is a corner, the second the center
 _SAMPLES = math.sqrt(2) * torch.erfinv(2 * _SOBOL.draw(32, dtype=torch.float64) - 1)  # standard normal, the mean first
 _UNNOTICED = 0.02  # probability of having been at the destination: visited places stay possible
-_STAYED_KM = 1.0  # longest move after which the vehicle is where it was
+_STAYED_KM = 1.0  # longest leg after which the vehicle is where it was
 _FAR_KM = 1e5  # of places that are not there yet
 _LEAST_KM2 = 1e-12
 _LEAST_ELLIPSE = 1e-12  # [1/km^2]
@@ -27,13 +27,13 @@ _LEAST_ELLIPSE = 1e-12  # [1/km^2]
 def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
     """Return the displacement to the most probable destination, given where the vehicle did not arrive.
 
-    The density of the destination is that of the estimated way, times the probability of not arriving at the nearest
+    The density of the destination is the density of the estimate, times the probability of not arriving at the nearest
     visited place: near 0 at that place, half on the border of the arrival ellipse around it, 1 far from it. The
     displacement is the best of 32 quasi-random samples of the estimate, one of which is its mean: the largest
     logarithm of the density minus the distance over :data:`SEARCH_KM`. Without visited places near it, it is the mean.
 
     Args:
-        way: estimated way and its covariance.
+        way: estimated displacement and its covariance.
         visited: ``(..., K, 2)`` displacements to the visited places, northward and eastward [km].
         ellipse: ``(..., 2, 2)`` arrival ellipse, where ``d^T E d = 1`` for displacements d [km].
 
@@ -83,13 +83,13 @@ def unvisited_yet(like: Tensor) -> Tensor:
 
 
 def visit(visited: Tensor, displacement: Tensor) -> Tensor:
-    """Return the visited places after a move: all displacements change by the move, and its end is the latest place.
+    """Return the visited places after a leg: all displacements change by the leg, and its end is the latest place.
 
-    After a move below 1 km, the end takes the place of the one before.
+    After a leg below 1 km, the end takes the place of the one before.
 
     Args:
-        visited: ``(..., K, 2)`` displacements to the visited places before the move [km].
-        displacement: ``(..., 2)`` move [km].
+        visited: ``(..., K, 2)`` displacements to the visited places before the leg [km].
+        displacement: ``(..., 2)`` leg [km].
 
     Raises:
         ValueError: for shapes that do not match.

@@ -1,4 +1,4 @@
-"""The way to the destination: a normal distribution of the displacement, or weighted points."""
+"""The displacement to the destination: a normal distribution of the displacement, or weighted points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from magrl.checks import check_number
 
-_AT_ONCE = 13  # moves whose distances to all points are held at once
+_AT_ONCE = 13  # legs whose distances to all points are held at once
 _CANDIDATES = 16  # points among which that with most mass around it is chosen
 ELSEWHERE_KM = 10_000.0  # distance of a destination that is not within reach, half of the farthest
 
@@ -29,7 +29,7 @@ class Way(NamedTuple):
         """Return the standard deviations [km] along the long axis of the ellipse and across it, and the direction of
         the long axis [deg, clockwise from north, 0 to 180], each ``(...)``.
 
-        Where two elements do not determine a place, the way is known across a line, and not along it.
+        Where two elements do not determine a place, the displacement is known across a line, and not along it.
 
         Example:
             >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).axes()
@@ -41,7 +41,7 @@ class Way(NamedTuple):
         return (middle + half).sqrt(), (middle - half).clamp_min(0).sqrt(), bearing.remainder(180)
 
     def ellipse(self) -> str:
-        """Return the axes of one way as text.
+        """Return the axes of one displacement as text.
 
         Example:
             >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).ellipse()
@@ -77,7 +77,7 @@ class DestinationPosterior(NamedTuple):
         """Return the displacement to aim at ``(..., 2)`` [km]: the mean, or, where that is within a radius of the
         vehicle, the point that holds most probability within the radius.
 
-        Between two maxima the mean may be where the vehicle is, and no move makes progress.
+        Between two maxima the mean may be where the vehicle is, and no leg makes progress.
 
         Example:
             >>> points = torch.tensor([[0.0, 40.0], [0.0, -40.0], [0.0, -42.0]])
@@ -93,7 +93,7 @@ class DestinationPosterior(NamedTuple):
         return torch.where(mean.norm(dim=-1, keepdim=True) > radius_km, mean, center)
 
     def mean_distance(self, moves: Tensor) -> Tensor:
-        """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.
+        """Return the mean distances ``(..., K)`` [km] of the place after legs ``(..., K, 2)`` [km], as float32.
 
         Example:
             >>> posterior = DestinationPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
@@ -105,7 +105,7 @@ class DestinationPosterior(NamedTuple):
         return torch.cat(parts, -1)
 
     def _squares(self, moves: Tensor) -> Tensor:
-        """Return the squared distances ``(..., K, M)`` of the points after moves, as one matrix product [km^2]."""
+        """Return the squared distances ``(..., K, M)`` of the points after legs, as one matrix product [km^2]."""
         points, moves = self.points.float(), moves.float()
         # 0.01 km^2 is for the rounding
         left = torch.cat((moves, moves.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(moves[..., :1])), -1)

@@ -177,7 +177,7 @@ class GradientHeading(ObservationTransform):
 class AlignmentReward(StepReward):
     """Add the alignment term of Eq. 3-6 to the reward: high where an angle is close to a reference.
 
-    The reference is read before the move, the angle (the heading of the move just made) after it. In a replay buffer or
+    The reference is read before the leg, the angle (the heading of the leg just made) after it. In a replay buffer or
     as a module, the angle and the reward are those under ``"next"``.
 
     Args:

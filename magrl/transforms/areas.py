@@ -26,7 +26,7 @@ class NoGoAreas(EpisodeNumbers):
 
     A vehicle that steers straight at its destination must fail in some episodes, however well it knows the direction.
     Place this before the reward, which reads the success. Distances are those in the plane around the destination.
-    A radius is at most two thirds of the way from a center to either end of a task.
+    A radius is at most two thirds of the distance from a center to either end of a task.
 
     Args:
         **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`. The

@@ -24,7 +24,7 @@ class ObservationTransform(Transform):
 
     Args:
         in_keys: keys that are read, in the order of the names; optional ones at the end may be left out.
-        out_keys: keys that are written, in the same way.
+        out_keys: keys that are written, in the same order.
         **inverse: ``in_keys_inv`` and ``out_keys_inv`` of an invertible transform.
 
     Raises:

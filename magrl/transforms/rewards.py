@@ -1,4 +1,4 @@
-"""Rewards for short paths, and the true way to the destination, which is privileged: for critics and rewards only."""
+"""Rewards for short paths, and the true displacement to the destination, which is privileged."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from magrl.transforms.errors.base import Episode, EpisodeNumbers
 SPL_REWARD = 10.0
 """Reward for an SPL of 1."""
 UNIT_KM, ARRIVAL, PRICE = 50.0, 10.0, 0.1
-"""Distance of a reward of 1 [km], the longest move by default; reward for the arrival; price of a step."""
+"""Distance of a reward of 1 [km], the longest leg by default; reward for the arrival; price of a step."""
 
 
 class TrueWay(ObservationTransform):
-    """Write the true way to the destination in the vehicle's frame. Privileged: for critics and rewards only.
+    """Write the true displacement to the destination in the vehicle's frame. Privileged: for critics and rewards only.
 
     Args:
         in_keys: position ``(..., 2)`` and target position ``(..., 2)``, latitude and longitude [deg], and the heading
             ``(..., 1)`` [rad].
-        out_keys: one way ``(..., 2)``: forward and to the right [km], along the geodesic.
+        out_keys: one displacement ``(..., 2)``: forward and to the right [km], along the geodesic.
 
     Raises:
         ValueError: for another number of keys.
@@ -53,7 +53,7 @@ class TrueWay(ObservationTransform):
         return [way.to(heading.dtype)]
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the way, unbounded."""
+        """Add the displacement, unbounded."""
         self._add(observation_spec, self._leaf(observation_spec, self.in_keys[2]), self.out_keys[0], 2)
         return observation_spec
 
@@ -62,12 +62,12 @@ class ProgressReward(StepReward):
     """Write the reward for getting nearer to the destination, for the arrival, and minus the price of a step.
 
     The first term is ``gamma * phi(after) - phi(before)`` with ``gamma`` 1 and the potential ``phi`` of minus the
-    distance, which leaves the optimal policy without discount unchanged: a detour and its way back add up to 0. An
+    distance, which leaves the optimal policy without discount unchanged: a detour and the return add up to 0. An
     episode of up to 90 steps earns less than any arrival at the same destination if it ends without one. In place of
     the reward of the environment. Privileged.
 
     Args:
-        in_keys: true way ``(..., 2)`` [km], and the flag success ``(..., 1)``.
+        in_keys: true displacement ``(..., 2)`` [km], and the flag success ``(..., 1)``.
         out_keys: one reward ``(..., 1)``.
 
     Raises:
@@ -87,7 +87,7 @@ class ProgressReward(StepReward):
 
     @property
     def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the true way."""
+        """Keys that a step reads from the TensorDict before it: the true displacement."""
         return self.in_keys[:1]
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
@@ -98,12 +98,12 @@ class ProgressReward(StepReward):
 class HighestSPL(StatefulTransform):
     """Write the highest SPL (success weighted by path length) that an episode can still reach. Privileged.
 
-    It is the SPL of the straight way from the present position: the distance of the task over the path so far plus the
-    true way. After an arrival it is the SPL of the episode, after any other end 0.
+    It is the SPL of the straight path from the present position: the distance of the task over the path so far plus the
+    true displacement. After an arrival it is the SPL of the episode, after any other end 0.
 
     Args:
-        in_keys: true way ``(..., 2)`` [km], last move ``(..., K)`` with the distance [km] first, start position and
-            target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and done.
+        in_keys: true displacement ``(..., 2)`` [km], last leg ``(..., K)`` with the distance [km] first, start position
+            and target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and done.
         out_keys: one number ``(..., 1)`` in [0, 1], which is also the state.
 
     Raises:
@@ -123,7 +123,7 @@ class HighestSPL(StatefulTransform):
 
     @property
     def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the true way and the number itself."""
+        """Keys that a step reads from the TensorDict before it: the true displacement and the number itself."""
         return [self.in_keys[0], self.out_keys[0]]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
@@ -247,13 +247,13 @@ class EpisodeSum(StatefulTransform):
 
 
 class DistanceCost(StepReward):
-    """Subtract a cost of the distance of each move from a reward.
+    """Subtract a cost of the distance of each leg from a reward.
 
-    Without it, a move that brings the vehicle no nearer costs no more than waiting.
+    Without it, a leg that brings the vehicle no nearer costs no more than waiting.
 
     Args:
-        cost: cost of a move [1/km].
-        in_keys: one move ``(..., K)``, with the distance [km] first.
+        cost: cost of a leg [1/km].
+        in_keys: one leg ``(..., K)``, with the distance [km] first.
         out_keys: one reward ``(..., 1)``, from which the cost is subtracted.
 
     Raises:

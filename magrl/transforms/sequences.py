@@ -1,4 +1,4 @@
-"""Observation of readings and moves at each step, for policies with a memory."""
+"""Observation of readings and legs at each step, for policies with a memory."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ ACCURACY_KEYS = STD_KEYS[:2]
 
 
 class ReadingObservation(StatefulTransform):
-    """Write the reading, the last move and the change of the reading along it, scaled; nothing is estimated.
+    """Write the reading, the last leg and the change of the reading along it, scaled; nothing is estimated.
 
     A single observation does not hold the direction to the destination: a policy needs a memory, such as TorchRL's
     :class:`~torchrl.modules.GRUModule`. The state is the reading before the step.
 
     Args:
-        in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; last move ``(..., 2)`` with the distance
+        in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; last leg ``(..., 2)`` with the distance
             [km] first and the turn [rad] second; heading ``(..., 1)`` [rad]; and the accuracy that the vehicle knows
             ``(..., 3)`` each, of errors that are new in each reading and of all others, or no such keys with perfect
             sensors.
@@ -83,15 +83,15 @@ def observed_reading(
     Args:
         reading: ``(..., 3)`` D [deg], I [deg], B_H [nT].
         target: ``(..., 3)`` those at the destination.
-        moved: ``(..., 1)`` distance of the last move [km].
-        heading: ``(..., 1)`` direction of that move [rad].
+        moved: ``(..., 1)`` distance of the last leg [km].
+        heading: ``(..., 1)`` direction of that leg [rad].
         accuracy: standard deviations at :data:`ACCURACY_KEYS`, ``(..., 3)`` each.
-        before: ``(..., 3)`` reading before the move.
+        before: ``(..., 3)`` reading before the leg.
 
     Returns:
         ``(..., 26)``: reading and remaining differences (:func:`features`, 12), the change of D, I, B_H per kilometer
-        of the last move (3), how far along it the differences would be least, and how well it fits them (2), cosine and
-        sine of the heading, the distance of the move, and the accuracy (6).
+        of the last leg (3), how far along it the differences would be least, and how well it fits them (2), cosine and
+        sine of the heading, the distance of the leg, and the accuracy (6).
 
     Example:
         >>> reading, moved = torch.tensor([0.0, 60.0, 25000.0]), torch.tensor([20.0])

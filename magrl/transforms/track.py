@@ -1,4 +1,4 @@
-"""The track of a vehicle in a TorchRL environment: what it knows of the field, its way and its next move."""
+"""The track of a vehicle in a TorchRL environment: what it knows of the field, its displacement and its next leg."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ class TrackField(StatefulTransform):
 
     The nested key ``track`` has the state (float64, which a step reads from the TensorDict before it), the posterior of
     the displacement to the destination, its mean and covariance ``("track", "way", ...)`` [km], elements and gradients
-    ``("track", "local", ...)``, the aim and the planned move ``(..., 2)`` [km]. ``observation`` is what a network
+    ``("track", "local", ...)``, the aim and the planned leg ``(..., 2)`` [km]. ``observation`` is what a network
     observes that corrects the plan. Nothing that it writes is privileged unless an input is.
 
     Args:
         rules: what the vehicle knows before it starts.
         optional: keys of :data:`KNOWN_KEYS` that the environment has (:func:`known_keys`).
-        in_keys: reading and target ``(..., 3)``, the last move ``(..., K)`` (distance [km] first), heading ``(..., 1)``
+        in_keys: reading and target ``(..., 3)``, the last leg ``(..., K)`` (distance [km] first), heading ``(..., 1)``
             [rad], number of the step ``(..., 1)``, and the optional ones.
         out_keys: the track and the observation ``(..., 19)``.
 

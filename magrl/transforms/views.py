@@ -130,16 +130,16 @@ class ObservationView(_View):
 
     Args:
         observe_heading: whether cosine and sine of the heading are observed. Without them the state is that of Eq. 3-1,
-            from which a policy without memory cannot tell the direction of its next move.
+            from which a policy without memory cannot tell the direction of its next leg.
         observe_difference: whether target elements minus measured elements are observed.
         observe_areas: whether no-go areas in sight are observed (:class:`~magrl.transforms.NoGoAreas`).
         field_low: D [deg], I [deg], B_H [nT] that are scaled to -1.
         field_high: D [deg], I [deg], B_H [nT] that are scaled to 1.
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
-        ValueError: for bounds that are not finite or do not rise, a move or a turn out of range, or switches that are
+        ValueError: for bounds that are not finite or do not rise, a leg or a turn out of range, or switches that are
             not bool.
 
     Example:
@@ -231,11 +231,11 @@ class ReadingView(_View):
 
     Args:
         keys: observed keys, in the order of their numbers: among those of :data:`READING_SIZES`.
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
-        ValueError: for other keys, or a move or a turn out of range.
+        ValueError: for other keys, or a leg or a turn out of range.
 
     Example:
         >>> ReadingView(max_move_km=50.0, max_turn_rad=1.5).size

@@ -119,7 +119,7 @@ def place_errors(steps: TensorDictBase) -> dict[str, Tensor]:
         return distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
 
     reckoned = [steps["start_place"][:, 0].double()]
-    for number in range(steps.shape[1]):  # the heading is that of the move before
+    for number in range(steps.shape[1]):  # the heading is that of the leg before
         move = steps["move"][:, number, 0].double()
         reckoned.append(move_place(reckoned[-1], steps["heading"][:, number, 0].double(), move))
     errors = {

@@ -33,15 +33,15 @@ from torch import Tensor
 RECIPE = "measured.py"
 NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude", "altitude_km")
 SLOW = (0.05, 0.03, 15.0)
-"""Standard deviations of what varies along the way, crust and currents, on D, I [deg], B_H [nT]: 15 nT; chosen."""
+"""Standard deviations of what varies along the path, crust and currents, on D, I [deg], B_H [nT]: 15 nT; chosen."""
 RANGE_KM = {(300.0, 500.0): 400.0, (1200.0, 1800.0): 1000.0}
-"""Prior standard deviation of the way [km] for pieces of a length."""
+"""Prior standard deviation of the displacement [km] for pieces of a length."""
 PROBABILITIES = (0.5, 0.9, 0.95)
 
 
 @dataclass(frozen=True)
 class Survey:
-    """Rows of a log ``(T, ...)``: readings, IGRF there, headings [rad], moves [km], positions [deg]."""
+    """Rows of a log ``(T, ...)``: readings, IGRF there, headings [rad], legs [km], positions [deg]."""
 
     field: Tensor
     model: Tensor
@@ -66,7 +66,7 @@ def pieces(survey: Survey, low_km: float, high_km: float) -> Tensor:
 
 def flown(survey: Survey, rows: Tensor, noise: Tensor, target: Tensor, start: Tensor | None, range_km: float) -> Tensor:
     """Return for each reading ``(P, T - 1)`` the stated probability of the region whose border is at the destination,
-    and the error of the estimated way [km], ``(P, T - 1, 2)``.
+    and the error of the estimated displacement [km], ``(P, T - 1, 2)``.
 
     A region holds all places that are more probable than those on its border, so that it is right if the first is
     uniform from 0 to 1.
@@ -77,7 +77,7 @@ def flown(survey: Survey, rows: Tensor, noise: Tensor, target: Tensor, start: Te
         noise: standard deviations of the white noise.
         target: elements of the destinations ``(P, 3)``.
         start: known elements at the start ``(P, 3)``; None where they are not known.
-        range_km: prior standard deviation of the way.
+        range_km: prior standard deviation of the displacement.
     """
     generator = torch.Generator().manual_seed(0)
     reading = survey.field[rows] + noise * torch.randn(*rows.shape, 3, generator=generator).double()

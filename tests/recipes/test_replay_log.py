@@ -33,7 +33,7 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     assert table["stop"].iloc[-1] == "arrived"
     said = capsys.readouterr().out
     assert (tmp_path / "a" / "log.md").read_text(encoding="utf-8") in said
-    assert "Error of the estimated way at the end" in said
+    assert "Error of the estimated displacement at the end" in said
     assert (tmp_path / "a" / "log.png").stat().st_size > 10_000
     blind = pd.read_csv(LOG).drop(columns=["time", "latitude", "longitude"]).rename(columns={"D": "dec"})
     blind.to_csv(tmp_path / "blind.csv", index=False)
@@ -81,7 +81,7 @@ def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Pa
     said = capsys.readouterr().out
     assert "Warning: 7 rows with the time of the row before left out." in said
     assert "IGRF" not in said
-    assert "Error of the estimated way halfway" in said
+    assert "Error of the estimated displacement halfway" in said
     wrong = pd.read_csv(LOG)[:4]
     wrong.assign(I=-wrong["I"]).to_csv(path, index=False)
     recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "b")])
@@ -127,9 +127,9 @@ def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) ->
         (("1.310", ""), (), r"cannot read .*: row 2, D: '' is not a number"),
         (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
-        (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest move"),
+        (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest leg"),
         (("0.83", "20"), (), "time runs backward from row 2 to 3, from 20 to 1.67: sort the rows"),
-        (("", ""), ("--every-km", "5000"), "every_km 5000 leaves one reading of 25: choose shorter moves"),
+        (("", ""), ("--every-km", "5000"), "every_km 5000 leaves one reading of 25: choose shorter legs"),
         (("", ""), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
         (("", ""), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
         (("", ""), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),

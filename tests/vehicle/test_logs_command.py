@@ -41,7 +41,7 @@ def test_the_story_of_the_page(folder: Path, monkeypatch, capsys) -> None:
         monkeypatch.delitem(sys.modules, f"{name}.__main__", raising=False)
         run(name, run_name="__main__")
     said = capsys.readouterr().out
-    assert "15 readings, moves of 19.8 km" in said
+    assert "15 readings, legs of 19.8 km" in said
     assert "warning" not in said
     assert f"replay: {commands[-1]}" in said, "the page has the command that is printed"
     table = pd.read_csv(folder / "runs" / "replay_log" / "log.csv")

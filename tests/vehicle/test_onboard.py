@@ -322,7 +322,7 @@ def test_a_way_that_is_longer_than_a_move_is_reported_in_parts() -> None:
     """The path of all parts explains the change of I and B_H; that D is the same at both ends is no stuck sensor."""
     after, vehicle = (3.5, 79.0, 9000.0), begun(sensor_std=NOISE)
     before = vehicle.step(*HERE, 0.0)
-    with pytest.raises(ValueError, match="report a longer way in parts"):
+    with pytest.raises(ValueError, match="report a longer distance in parts"):
         vehicle.step(*after, 0.0, 700.0)
     for _ in range(13):
         command = vehicle.step(None, None, None, 0.0, 50.0)

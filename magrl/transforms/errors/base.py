@@ -33,7 +33,7 @@ reading to which another error is added, would reveal that field or that reading
 EPISODE_STREAM = "episode_stream"
 """Key of the environment's number of an episode, from which random numbers derive: ``(..., 1)`` int64, privileged."""
 DISPLACEMENT = "displacement"
-"""Key of what the environment adds to a commanded move, northward and eastward ``(..., 2)`` [km]."""
+"""Key of what the environment adds to a commanded leg, northward and eastward ``(..., 2)`` [km]."""
 
 
 class Episode(NamedTuple):
@@ -156,13 +156,13 @@ class EpisodeErrors(EpisodeNumbers):
         return SensorStd(*(torch.zeros_like(field) for _ in STD_KEYS))
 
     def farthest_km(self, max_move_km: float) -> float:
-        """Return the longest path on the ground of a commanded move [km].
+        """Return the longest path on the ground of a commanded leg [km].
 
         Args:
-            max_move_km: longest move that a policy may command [km].
+            max_move_km: longest leg that a policy may command [km].
 
         Raises:
-            ValueError: for a move that is not above 0.
+            ValueError: for a leg that is not above 0.
         """
         check_number(0, above=True, max_move_km=max_move_km)
         return max_move_km

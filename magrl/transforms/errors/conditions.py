@@ -107,15 +107,15 @@ class Conditions:
         return self.transforms()
 
     def drift_km(self, max_move_km: float) -> float:
-        """Return how much farther than a longest move the errors may carry a vehicle, rounded up [km].
+        """Return how much farther than a longest leg the errors may carry a vehicle, rounded up [km].
 
-        It is at least 1 with errors of motion: they turn a move, which an environment without drift does not allow.
+        It is at least 1 with errors of motion: they turn a leg, which an environment without drift does not allow.
 
         Args:
-            max_move_km: longest move that a policy may command [km].
+            max_move_km: longest leg that a policy may command [km].
 
         Raises:
-            ValueError: for a move that is not above 0.
+            ValueError: for a leg that is not above 0.
 
         Example:
             >>> CONDITIONS["laboratory"].drift_km(50.0), CONDITIONS["ship"].drift_km(50.0)
@@ -134,8 +134,9 @@ class Conditions:
 
     @cached_property
     def motion_std(self) -> tuple[float, float]:
-        """Errors of dead reckoning along each axis, as a vehicle knows them: its constant drift [share of the way], and
-        the random part after 1 km [km].
+        """Errors of dead reckoning along each axis, as a vehicle knows them.
+
+        They are its constant drift [share of the distance], and the random part after 1 km [km].
 
         Log, current and the constant error of true north drift; eddies and the noise of the log are random.
 
@@ -235,7 +236,7 @@ def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -
         seed: seed of the errors.
 
     Raises:
-        ValueError: for an unknown preset, or an environment that does not allow the farthest move.
+        ValueError: for an unknown preset, or an environment that does not allow the farthest leg.
         TypeError: for another environment.
 
     Example:

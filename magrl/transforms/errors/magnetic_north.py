@@ -20,9 +20,9 @@ class MagneticNorth(ReadingErrors):
     """Measure headings from magnetic north: the vehicle has a magnetometer and an accelerometer, and no true north.
 
     D is the direction of magnetic north from the vehicle's own north, so it reads 0 everywhere, and that of the
-    destination is 0, too. That it tells nothing is stated by a ``bias_std`` of infinity. A move starts along the
+    destination is 0, too. That it tells nothing is stated by a ``bias_std`` of infinity. A leg starts along the
     vehicle's heading from magnetic north and keeps its course on the ground; at its end, the vehicle turns to the same
-    heading from magnetic north there. So headings tell nothing of how D changes along the way. (On the Earth up to 60
+    heading from magnetic north there. So headings tell nothing of how D changes along the path. (On the Earth up to 60
     degrees of latitude, it changes by 0.2 degrees over 50 km on the mean, and a vehicle that follows its needle ends
     0.1 km beside this one.)
 

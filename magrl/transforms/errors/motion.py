@@ -29,29 +29,29 @@ class MotionError(EpisodeErrors):
     is written as ``displacement``, which the environment adds. The heading itself is right, so a declination measured
     from it is, too; see :class:`~magrl.transforms.NorthReferenceError` for the contrary.
 
-    Sizes are standard deviations of normal errors, cut at four of them, so that the farthest move is known
+    Sizes are standard deviations of normal errors, cut at four of them, so that the farthest leg is known
     (:meth:`farthest_km`). The environment must allow it: ``GeomagneticNavEnv(drift_km=...)``. Stands before every
     transform of the action, such as its scaling.
 
     Args:
         log_scale: error of the log in an episode, as a share of the distance.
-        log_noise: error of the log in a move, as a share of the distance.
+        log_noise: error of the log in a leg, as a share of the distance.
         compass_deg: error of the compass in motion in an episode [deg].
         current_km_h: speed of a current whose direction is random in each episode [km/h].
         eddies_km_h: root-mean-square speed of a field of eddies, another one in each episode [km/h]; see
-            :func:`eddy_velocity`. Its value at the start of a move holds for all of it.
+            :func:`eddy_velocity`. Its value at the start of a leg holds for all of it.
         eddy_km: wavelength of the eddies [km].
         speed_km_h: speed of the vehicle through the water or the air [km/h]; needed with currents.
         fixed: whether ``log_scale`` and ``compass_deg`` are the errors themselves, in every episode.
-        in_keys: last move ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
+        in_keys: last leg ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
             ``(..., 2)`` [deg].
-        out_keys: true move ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
+        out_keys: true leg ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeErrors`. The errors of the
             episode are scale, compass [deg], direction of the current and phases of the eddies [rad].
 
     Raises:
-        ValueError: for a negative size, errors of the log that could turn a move around, a current without a speed of
-            the vehicle, another number of keys, or an environment that does not allow the farthest move.
+        ValueError: for a negative size, errors of the log that could turn a leg around, a current without a speed of
+            the vehicle, another number of keys, or an environment that does not allow the farthest leg.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -106,7 +106,7 @@ class MotionError(EpisodeErrors):
         return 1 + scale[0] - noise, 1 + scale[1] + noise
 
     def farthest_km(self, max_move_km: float) -> float:
-        """Return the longest path on the ground of a commanded move [km].
+        """Return the longest path on the ground of a commanded leg [km].
 
         Example:
             >>> MotionError(log_noise=0.01, current_km_h=3.0, speed_km_h=30.0).farthest_km(50.0)
@@ -124,7 +124,7 @@ class MotionError(EpisodeErrors):
         return torch.cat((constants, 2 * math.pi * uniform[..., 2:]), -1)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write what the errors add to the commanded move, which the environment adds."""
+        """Write what the errors add to the commanded leg, which the environment adds."""
         values = self._read(tensordict, [*self.in_keys_inv, self.in_keys[2]])
         state = self._state(tensordict)
         if values is not None and state is not None:
@@ -134,7 +134,7 @@ class MotionError(EpisodeErrors):
     def _displacement(
         self, action: Tensor, heading: Tensor, position: Tensor, errors: Tensor, stream: Tensor
     ) -> Tensor:
-        """Return the move on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
+        """Return the leg on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
         distance, turn = action[..., :2].double().unbind(-1)
         bow, errors = wrap_angle(heading[..., 0] + turn), errors.double()
         scale, compass, direction = errors[..., :3].unbind(-1)
@@ -150,7 +150,7 @@ class MotionError(EpisodeErrors):
         return displacement
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        """Write the true move and its direction."""
+        """Write the true leg and its direction."""
         move, heading, _ = values
         if not episode.first:
             distance, bow = move[..., 0].double(), heading[..., 0].double()
@@ -163,7 +163,7 @@ class MotionError(EpisodeErrors):
     # Specs
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the true move, its direction, the errors and the state of the numbers."""
+        """Add the true leg, its direction, the errors and the state of the numbers."""
         observation_spec = super().transform_observation_spec(observation_spec)
         move, heading, _ = (observation_spec[key] for key in self.in_keys)
         self._add(observation_spec, move, self.out_keys[0], 2)
@@ -171,7 +171,7 @@ class MotionError(EpisodeErrors):
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make what a step reads part of the state, and check that the environment allows the farthest move.
+        """Make what a step reads part of the state, and check that the environment allows the farthest leg.
 
         Raises:
             ValueError: if it does not, with the distance that is missing.

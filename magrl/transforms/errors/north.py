@@ -64,7 +64,7 @@ class NorthReferenceError(ReadingErrors):
         random_deg: standard deviation of the random part [deg].
         drift_length_km: correlation length of the drift, with ``drift_deg`` alone [km].
         fixed: whether ``constant_deg`` is the constant part itself, in every episode; it may then be negative.
-        in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, the last move, whose first number
+        in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, the last leg, whose first number
             is the distance [km], and optionally the position ``(..., 2)``, latitude and longitude [deg]: b then grows
             with the secant of the latitude, as that of every gyrocompass does.
         out_keys: the heading and the elements that the vehicle reads, in place by default.

@@ -41,7 +41,7 @@ class SensorErrors(ReadingErrors):
         bias: constant error.
         scale: error of the scale, as a share of the value, where the elements are D, I, B_H.
         drift: slow drift.
-        drift_length: its correlation length [unit of the distance of a move, or steps].
+        drift_length: its correlation length [unit of the distance of a leg, or steps].
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
         outage_rate: probability that a reading is missing; never the first of an episode.
         vector: errors of a vector magnetometer, where the elements are D, I, B_H.
@@ -49,7 +49,7 @@ class SensorErrors(ReadingErrors):
         levels: function of uniform numbers ``(..., 12)`` in [0, 1), which returns further standard deviations
             ``(..., 2 E)`` for each vehicle and episode, such as :func:`~magrl.transforms.sensor_levels`: of white
             noise, then of a bias, whose variance is shared between a constant error and a drift at random.
-        in_keys: a value ``(..., E)``; optionally the last move ``(..., K)``, whose first number is its distance,
+        in_keys: a value ``(..., E)``; optionally the last leg ``(..., K)``, whose first number is its distance,
             without which the drift is by steps; and optionally the heading ``(..., 1)`` [rad], in whose axes ``vector``
             acts.
         out_keys: the reading ``(..., E)``, in place by default.

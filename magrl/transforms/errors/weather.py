@@ -20,7 +20,7 @@ from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import Episode, ReadingErrors
 
 READING_S = 60.0
-"""Time that each step takes beside its move [s], so that standing still takes time; chosen."""
+"""Time that each step takes beside its leg [s], so that standing still takes time; chosen."""
 
 
 class MagneticWeather(ReadingErrors):
@@ -39,14 +39,14 @@ class MagneticWeather(ReadingErrors):
         record: name in :data:`magrl.field.WEATHER`, or a record of one's own.
         speed_km_h: speed of the vehicles [km/h].
         span_h: longest duration of an episode [h]: it starts where the record has no gap for that time; after it, the
-            weather stays constant. By default the longest moves until the step
+            weather stays constant. By default the longest legs until the step
             limit, where the environment has ``max_steps`` and ``max_move_km``.
         way_km: distance of a trip, whose weather a vehicle expects [km].
         surrogates: number of variations with the spectrum of the record and random phases
             (:meth:`~magrl.field.WeatherRecord.surrogates`), one of which each episode of a training gets: with an
             environment of a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`. Evaluations, with the seeds from there
             on, get the record itself, which no training has seen.
-        in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last move ``(..., K)``, whose first number is the
+        in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last leg ``(..., K)``, whose first number is the
             distance [km].
         out_keys: the measured elements ``(..., 3)``, in place by default.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
@@ -100,7 +100,7 @@ class MagneticWeather(ReadingErrors):
             self._starts()
 
     def _longest_h(self) -> float:
-        """Return the longest time of an episode [h]; by default that of the longest moves until the step limit."""
+        """Return the longest time of an episode [h]; by default that of the longest legs until the step limit."""
         if self.span_h is not None:
             return self.span_h
         steps, move_km = (getattr(self.parent, name, None) for name in ("max_steps", "max_move_km"))

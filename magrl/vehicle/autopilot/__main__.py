@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
     add("--start-km", type=float, default=0.1, help="error of the place of the start [km]; default 0.1")
     add("--date", help="date of the flight, such as 2026-06-30, for the model of the Earth")
     add("--model", default=NEWEST, help=f"model of the Earth: IGRF-14, IGRF-13, IGRF-2005, ...; default {NEWEST}")
-    add("--drift", type=float, default=0.03, help="errors of log and current [share of the way]; default 0.03")
+    add("--drift", type=float, default=0.03, help="errors of log and current [share of the distance]; default 0.03")
     add("--altitude", type=float, default=0.0, help="altitude of the flight, for the model [km]; default 0")
     add("--navigator", default="anywhere", help="anywhere, kalman, memory, secant, or a policy file; default anywhere")
     add("--north", choices=("true", "magnetic"), default="true", help="north of the vehicle; default true")

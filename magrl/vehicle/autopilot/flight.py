@@ -34,7 +34,7 @@ class Link(Protocol):
         """Send a heading to steer, in the reference of the autopilot."""
 
     def report(self, command: Command) -> None:
-        """Send the estimated way."""
+        """Send the estimated displacement."""
 
 
 def fly(loop: Loop, link: Link, folder: Path | str) -> Iterator[Command]:

@@ -1,4 +1,4 @@
-"""The loop of a vehicle: measurements in, a heading to steer out, one step of the navigator for each move."""
+"""The loop of a vehicle: measurements in, a heading to steer out, one step of the navigator for each leg."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LATE_S, GAP_S = 60.0, 3600.0
 TURN_S = 120.0
 """A turn on the spot ends at the latest after this time; chosen [s]."""
 _ALIGNED_DEG = 10.0  # the turn is made
-_SHORT_KM = 1.0  # a shorter way is that of a turn, not a move
+_SHORT_KM = 1.0  # a shorter path is a turn, not a leg
 _LEAST_SAMPLES = 3
 _ONE_READING_KM = 1e9
 _QUANTITIES = (*AXES, *ATTITUDE, "speed")
@@ -125,8 +125,8 @@ class Measurement(NamedTuple):
 class Loop:
     """Steer a vehicle by :class:`~magrl.vehicle.onboard.Onboard` from the messages of its autopilot.
 
-    The loop integrates the moves from heading and speed. At the end of a move it averages the field over ``read_s``
-    seconds, without spikes, and reports the mean of the field at the mean of its places: one step a move. A field that
+    The loop integrates the legs from heading and speed. At the end of a leg it averages the field over ``read_s``
+    seconds, without spikes, and reports the mean of the field at the mean of its places: one step a leg. A field that
     does not change in any digit, that is missing or that the vehicle rejects is reported as missing, and the vehicle
     continues by dead reckoning. While speed or heading is not heard, or the computer was suspended, the last one is
     taken, and the stated error of the leg grows. Messages may come late, twice or out of order. The time is that of the
@@ -184,7 +184,7 @@ class Loop:
         return tuple(name for name in _QUANTITIES if name not in self._latest)
 
     def take(self, measurement: Measurement) -> Command | None:
-        """Take a message, and return the command if a move has ended with it.
+        """Take a message, and return the command if a leg has ended with it.
 
         Raises:
             RuntimeError: after a command to stop.
@@ -240,7 +240,7 @@ class Loop:
         return self._latest[name][1]
 
     def _is_there(self) -> bool:
-        """Return whether the move is made, so that the reading in its middle is at its end."""
+        """Return whether the leg is made, so that the reading in its middle is at its end."""
         command = self.command
         assert command is not None
         if command.distance_km == 0:
@@ -267,7 +267,7 @@ class Loop:
         return self.command
 
     def _step(self, rows: np.ndarray) -> Command | None:
-        """Report the move and its reading; None where the first reading is not possible."""
+        """Report the leg and its reading; None where the first reading is not possible."""
         reading, heading, offset, self.note = self._mean(rows)
         place: _Place = tuple(rows[:, -2:].mean(0).tolist()) if len(rows) else self._place
         north, east = (new - old for new, old in zip(place, self._origin, strict=True))
@@ -284,7 +284,7 @@ class Loop:
         return command
 
     def _report(self, reading: Sequence[float | None], heading: float, distance: float) -> Command | None:
-        """Report a move, in parts where it is longer than one move, and without a reading that is refused.
+        """Report a leg, in parts where it is longer than one leg, and without a reading that is refused.
 
         Returns None where the first reading is refused.
         """

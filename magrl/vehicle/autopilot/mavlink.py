@@ -188,7 +188,7 @@ class MavlinkLink:
         mav.set_position_target_local_ned_send(0, *self._vehicle, 1, self._mask, *rest, *velocity, *rest, yaw, 0.0)
 
     def report(self, command: Command) -> None:
-        """Send the estimated way."""
+        """Send the estimated displacement."""
         values = (*command.way_km, command.error_km, command.confidence)
         for name, value in zip((b"mg_north", b"mg_east", b"mg_error", b"mg_conf"), values, strict=True):
             self._connection.mav.named_value_float_send(0, name, value)

@@ -81,8 +81,9 @@ class NmeaLink:
     """Connection to instruments and the autopilot of a ship.
 
     It reads HDT, THS, HDG or HDM, VHW, VBW or VTG, and XDR with the axes of the magnetometer (names such as
-    ``MAG_X_NT``) and PTCH and ROLL. It sends HSC and APB with the heading to steer, and ``$PMGRL`` with the way
-    northward and eastward [km], its error [km], the confidence, and why to stop. Times are those of receipt.
+    ``MAG_X_NT``) and PTCH and ROLL. It sends HSC and APB with the heading to steer, and ``$PMGRL`` with the
+    displacement northward and eastward [km], its error [km], the confidence, and why to stop. A message has its
+    time of receipt.
 
     Args:
         address: ``"udp:10110"``, the port at which sentences arrive and to the sender of the last one that counts the
@@ -127,7 +128,7 @@ class NmeaLink:
         self._send(f"{_TALKER}APB,A,A,0.00,R,N,V,V,{course},MAGRL,{course},{course}")
 
     def report(self, command: Command) -> None:
-        """Send the estimated way."""
+        """Send the estimated displacement."""
         north, east = command.way_km
         way = f"{north:.1f},{east:.1f},{command.error_km:.1f},{command.confidence:.2f},{command.stop or ''}"
         self._send(f"PMGRL,WAY,{way}")

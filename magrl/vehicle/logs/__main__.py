@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
     add("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
     add("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a calibrated one in use")
     add("--north", choices=NORTHS, help="north of the heading; default that of the log")
-    add("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
+    add("--every-km", type=float, default=20.0, help="least length of a leg [km]; default 20")
     add("--calibration", type=Path, help="file of a calibration, which corrects the axes")
     add("--calibrate", type=Path, help="calibration to write (.json), of the swing in this log")
     add("--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H")
@@ -124,7 +124,7 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
         lines.append(f"minus IGRF of {date}, mean of {len(table)}: {_elements(mean)}")
     lines += [f"warning: {text}" for text in mistakes(table, date)]
     if len(table) < 2:
-        return [*lines, "one reading: no file is written; choose shorter moves by --every-km"]
+        return [*lines, "one reading: no file is written; choose shorter legs by --every-km"]
     return [*lines, *_written(table, log, options, iron)]
 
 
@@ -140,7 +140,7 @@ def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Cali
     missing = "" if iron else "; no calibration: give --bias of your sensors"
     magnetic = "" if _north(log, options) == "true" else " --north magnetic"
     return [
-        f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",
+        f"{len(table)} readings, legs of {table['distance'][1:].mean():.3g} km: {out}",
         f"replay: python recipes/replay_log.py {out}{magnetic} --noise {noise} --bias {bias}{missing}",
     ]
 

@@ -38,22 +38,22 @@ def readings_of(
     north: str | None = None,
     calibration: Calibration | None = None,
 ) -> DataFrame:
-    """Return one reading for each move: the mean of the samples of that part of the track, at their mean position.
+    """Return one reading for each leg: the mean of the samples of that part of the track, at their mean position.
 
-    The parts are as long as the moves, so that every sample counts once. The vector is averaged, without spikes.
+    The parts are as long as the legs, so that every sample counts once. The vector is averaged, without spikes.
     Positions are by dead reckoning along the heading, from the distances or the speeds of the log, or from its
     positions where it has neither.
 
     Args:
         log: samples. Without a heading, it is that of a compass: the horizontal field, leveled by roll and pitch.
-        every_km: least length of a move.
+        every_km: least length of a leg.
         north: north of the heading, one of :data:`~magrl.vehicle.logs.conventions.NORTHS`; default that of the log.
         calibration: correction of the axes.
 
     Returns:
-        Columns of ``recipes/replay_log.py``: ``time``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` of the move
+        Columns of ``recipes/replay_log.py``: ``time``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` of the leg
         since the row before, ``latitude`` and ``longitude`` where known; and ``D_std``, ``I_std``, ``B_H_std``, the
-        standard deviations of the means by the scatter of tenths of their samples, NaN where all moves have less than
+        standard deviations of the means by the scatter of tenths of their samples, NaN where all legs have less than
         three, ``samples``, and ``spikes``.
 
     Raises:
@@ -97,7 +97,7 @@ def _with_compass(log: Log, axes: Tensor) -> Log:
 
 
 def read_readings(path: Path | str, names: Mapping[str, str], time: str | None = None) -> DataFrame:
-    """Return the readings of a CSV file with a header, one for each move.
+    """Return the readings of a CSV file with a header, one for each leg.
 
     Args:
         path: the file.
@@ -154,17 +154,17 @@ def _columns(raw: DataFrame, names: Mapping[str, str]) -> dict[str, Array]:
 
 
 def joined(table: DataFrame, every_km: float) -> DataFrame:
-    """Return the means of the rows of each move in a table that already holds D, I, B_H; see :func:`readings_of`.
+    """Return the means of the rows of each leg in a table that already holds D, I, B_H; see :func:`readings_of`.
 
     Args:
         table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
-        every_km: least length of a move; 0 for the rows as they are.
+        every_km: least length of a leg; 0 for the rows as they are.
 
     Returns:
-        The same columns; the others are those of the middle row of each move.
+        The same columns; the others are those of the middle row of each leg.
 
     Raises:
-        ValueError: for moves so long that one reading is left.
+        ValueError: for legs so long that one reading is left.
 
     Example:
         >>> rows = {"row": range(1, 7), "D": 0.0, "I": 0.0, "B_H": range(6)}
@@ -181,7 +181,7 @@ def joined(table: DataFrame, every_km: float) -> DataFrame:
     samples = table.assign(time=np.arange(len(table)), **dict(zip(AXES, axes.T, strict=True)))
     readings = readings_of(Log(samples, "readings", "true"), every_km=every_km)
     if len(readings) < 2:
-        raise ValueError(f"every_km {every_km:g} leaves one reading of {len(table)}: choose shorter moves")
+        raise ValueError(f"every_km {every_km:g} leaves one reading of {len(table)}: choose shorter legs")
     middle = table.iloc[readings["time"].astype(int)].reset_index(drop=True)
     return middle.assign(**{name: readings[name] for name in readings if name in table and name != "time"})
 
@@ -198,7 +198,7 @@ def _path(log: Log) -> Array:
         distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
         length, heading = (np.concatenate(([0.0], values.numpy())) for values in (distance, bearing))
     else:
-        raise ValueError("the log has neither distances nor speeds nor positions, for the moves: log one of them")
+        raise ValueError("the log has neither distances nor speeds nor positions, for the legs: log one of them")
     return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
 
 
@@ -290,12 +290,12 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     """Return the likely mistakes in a log with positions, as sentences; none where it fits.
 
     Readings are compared with IGRF, within the accuracy of a model of the core
-    (:data:`~magrl.vehicle.onboard.known.MODEL_STD`), and moves with the positions.
+    (:data:`~magrl.vehicle.onboard.known.MODEL_STD`), and legs with the positions.
 
     Args:
         readings: columns of :func:`~magrl.vehicle.logs.readings_of`. Where D is not measured (``D_std``), it converts
             the headings.
-        date: date for IGRF; without it, moves alone are compared.
+        date: date for IGRF; without it, legs alone are compared.
 
     Example:
         >>> import pandas
@@ -364,7 +364,7 @@ def _measured(readings: DataFrame) -> bool:
     return "D_std" not in readings or bool((readings["D_std"] < OUTAGE_STD).any())
 
 
-# Moves
+# Legs
 
 
 def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> list[str]:
@@ -376,7 +376,7 @@ def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> l
         return []
     texts, ratio = [], float((distance[going] / moved[going]).median())
     if abs(ratio - 1) > MOST_DRIFT:
-        far = f"the positions are {ratio:.3g} times as far apart as the distances of the moves"
+        far = f"the positions are {ratio:.3g} times as far apart as the distances of the legs"
         texts.append(f"{far}: check the log and its unit")
     turn, east = torch.rad2deg(bearing[going]) - heading[going], declination[1:][going]
     course = torch.deg2rad(turn)

@@ -189,10 +189,10 @@ class Command:
     """Hold the command of a step and the estimates of the destination.
 
     Args:
-        distance_km: distance to move; 0 to stay and read again.
-        turn_deg: turn before the move, to the right.
+        distance_km: length of the leg; 0 to stay and read again.
+        turn_deg: turn before the leg, to the right.
         heading_deg: heading after that turn, 0 to 360: what to steer.
-        way_km: mean of the way to the destination, northward and eastward.
+        way_km: mean of the displacement to the destination, northward and eastward.
         way_covariance_km2: its covariance, by rows.
         confidence: estimated probability that the destination is within ``radius_km`` of the options.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
@@ -201,7 +201,7 @@ class Command:
         error_radius_km: radius that holds the destination with the ``confidence`` of the options.
         place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
         place_covariance_km2: covariance of the place, northward and eastward.
-        drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the way].
+        drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the distance].
         drift_covariance: its covariance, by rows.
         sensor_errors: estimated constant errors of D [deg], I [deg], B_H [nT], to be subtracted from readings.
         sensor_errors_std: their standard deviations.
@@ -240,8 +240,10 @@ class Command:
 
     @property
     def axes(self) -> tuple[float, float, float]:
-        """Standard deviations of the estimated way along the long axis of its ellipse and across it [km], and the
-        direction of that axis [deg, 0 to 180]: a long ellipse is a line on which the destination is."""
+        """Standard deviations along the long axis of the displacement's ellipse and across it [km], and its direction.
+
+        The direction is from 0 to 180 [deg]. A long ellipse is a line on which the destination is.
+        """
         along, across, bearing = Way(torch.tensor(self.way_km), torch.tensor(self.way_covariance_km2)).axes()
         return along.item(), across.item(), bearing.item()
 

@@ -2,7 +2,7 @@
 
 The limits of the field are those of IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity
 of 21 900 to 69 400 nT, a horizontal intensity up to 41 900 nT, and a change of the vector of up to 16 nT/km between
-75° S and 75° N and 63 nT/km up to 88°, where north turns along the way; B_H and B_Z alone change by up to 16.4 nT/km
+75° S and 75° N and 63 nT/km up to 88°, where north turns along the path; B_H and B_Z alone change by up to 16.4 nT/km
 anywhere. Where the inclination is within 1.6 degrees, the horizontal intensity is at least 24 100 nT and the gradient
 of the inclination at least 1.5 degrees per 100 km. The checks leave room for the crust, magnetic storms, altitude and
 errors of sensors.
@@ -28,9 +28,9 @@ EQUATOR_NT = 22000.0
 EQUATOR_SLOPE_DEG = 0.5
 """Least gradient of the inclination where it is within pi/2 degrees: a third of that of IGRF [deg per 100 km]."""
 SLOPE_NT_KM = 60.0
-"""Greatest change of the field vector along a way, up to 88 degrees of latitude [nT/km]."""
+"""Greatest change of the field vector along a path, up to 88 degrees of latitude [nT/km]."""
 MERIDIAN_SLOPE_NT_KM = 16.4
-"""Greatest change of B_H and B_Z, which do not depend on where north is, along a way [nT/km]."""
+"""Greatest change of B_H and B_Z, which do not depend on where north is, along a path [nT/km]."""
 DISTURBANCE_NT = 2000.0
 """Change of the field vector between two readings by the crust and a severe magnetic storm; chosen [nT]."""
 _SLACK_DEG = 1.0  # of an inclination
@@ -39,9 +39,9 @@ LEAST_NT = 2000.0
 """Least B_H for an agent without a map: below, it fails more often (docs/results.md, the whole globe) [nT]."""
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
-of the longest moves [km]. Coarse readings of one element can stay equal that long; chosen."""
+of the longest legs [km]. Coarse readings of one element can stay equal that long; chosen."""
 LONGER = 1.1
-"""A move may be as many times as long as the longest one that is commanded."""
+"""A leg may be as many times as long as the longest one that is commanded."""
 
 Triple = tuple[float, float, float]
 Incomplete = tuple[float | None, float | None, float | None]
@@ -104,12 +104,12 @@ def _horizontal_limits(inclination: float) -> tuple[float, float]:
 
 
 def check_earth_distance(reading: Sequence[float], target: Sequence[float], most_km: float) -> None:
-    """Raise if places with such elements are farther apart on the Earth than the longest way.
+    """Raise if places with such elements are farther apart on the Earth than the longest distance.
 
     Args:
         reading: D [deg], I [deg], B_H [nT] at the start.
         target: the same at the destination.
-        most_km: longest way [km].
+        most_km: longest distance [km].
 
     Raises:
         ValueError: with the least distance.
@@ -117,14 +117,14 @@ def check_earth_distance(reading: Sequence[float], target: Sequence[float], most
     Example:
         >>> check_earth_distance((-7.7, -7.7, 40000.0), (3.3, 74.9, 13581.0), 2500.0)
         Traceback (most recent call last):
-        ValueError: the reading at the start is at least 3639 km from the target, and the longest way is 2500 km: \
+        ValueError: the reading at the start is at least 3639 km from the target, and the longest distance is 2500 km: \
 check the target, and the axes, the units and the calibration of the sensors
     """
     here, there = ((b, b * math.tan(math.radians(i))) for _, i, b in (reading, target))  # B_H and B_Z
     least_km = (math.dist(here, there) - DISTURBANCE_NT) / MERIDIAN_SLOPE_NT_KM
     if least_km > most_km:
         raise ValueError(
-            f"the reading at the start is at least {least_km:.0f} km from the target, and the longest way is "
+            f"the reading at the start is at least {least_km:.0f} km from the target, and the longest distance is "
             f"{most_km:.0f} km: check the target, and the axes, the units and the calibration of the sensors"
         )
 
@@ -132,25 +132,25 @@ check the target, and the axes, the units and the calibration of the sensors
 def check_earth_jump(
     before: Sequence[float], after: Sequence[float], distance_km: float, noise: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> None:
-    """Raise unless a move can explain the change between two readings, up to 88 degrees of latitude.
+    """Raise unless a leg can explain the change between two readings, up to 88 degrees of latitude.
 
-    The change of each element is a change of the field vector of at least so many nanotesla. A move changes the vector
+    The change of each element is a change of the field vector of at least so many nanotesla. A leg changes the vector
     by at most :data:`SLOPE_NT_KM`, anything else by :data:`DISTURBANCE_NT`.
 
     Args:
-        before: D [deg], I [deg], B_H [nT] before the move.
+        before: D [deg], I [deg], B_H [nT] before the leg.
         after: the same after it.
-        distance_km: length of the move [km].
+        distance_km: length of the leg [km].
         noise: standard deviations of the noise of a reading, in the same units.
 
     Raises:
-        ValueError: naming the element, both values, and what a move of this length can explain.
+        ValueError: naming the element, both values, and what a leg of this length can explain.
 
     Example:
         >>> check_earth_jump((3.5, 73.0, 15000.0), (4.0, 72.5, 15400.0), 50.0)
         >>> check_earth_jump((3.5, 40.0, 25000.0), (3.5, -40.0, 25000.0), 50.0)
         Traceback (most recent call last):
-        ValueError: inclination changed from 40 to -40 deg over 50 km, by 41955 nT of the field vector; a move of this \
+        ValueError: inclination changed from 40 to -40 deg over 50 km, by 41955 nT of the field vector; a leg of this \
 length explains at most 5000 nT: the reading is wrong, or the distance is
     """
     check_numbers(3, before=before, after=after, noise=noise)
@@ -166,7 +166,7 @@ length explains at most 5000 nT: the reading is wrong, or the distance is
         if radius[index] * change > most:
             raise ValueError(
                 f"{name} changed from {before[index]:g} to {after[index]:g} {unit} over {distance_km:g} km, by "
-                f"{radius[index] * change:.0f} nT of the field vector; a move of this length explains at most "
+                f"{radius[index] * change:.0f} nT of the field vector; a leg of this length explains at most "
                 f"{most:.0f} nT: the reading is wrong, or the distance is"
             )
 
@@ -205,11 +205,11 @@ def measured(std: Sequence[float]) -> tuple[bool, ...]:
 
 
 def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Incomplete, move_km: float) -> Triple:
-    """Return the path since each element last changed ``(3,)`` [km], without moves that end without reading it.
+    """Return the path since each element last changed ``(3,)`` [km], without legs that end without reading it.
 
     Args:
-        unchanged: that path before the move.
-        before: D, I, B_H before the move.
+        unchanged: that path before the leg.
+        before: D, I, B_H before the leg.
         after: the same after it; None for an element that was not read.
         move_km: its length.
 
@@ -229,7 +229,7 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
 
     Args:
         unchanged: from :func:`unchanged_km`; 0 for an element that is not measured.
-        max_move_km: longest move.
+        max_move_km: longest leg.
 
     Example:
         >>> stuck((450.0, 20.0, 0.0), max_move_km=50.0)

@@ -47,7 +47,7 @@ def calibrated(reading: Reading, known: Tensor, known_std: Tensor) -> tuple[Tens
 
 
 class Other:
-    """Another navigator: from readings to moves.
+    """Another navigator: from readings to legs.
 
     Args:
         navigator: ``"secant"``, ``"memory"``, a file of :func:`magrl.save_policy`, a policy, or a navigator.
@@ -79,7 +79,7 @@ class Other:
         self.range = getattr(view, "field_limits", ((-180.0, -90.0, 0.0), (180.0, 90.0, math.inf)))
 
     def begun(self, options: Options, reading: Reading) -> Other:
-        """Return the navigator at the start of a way, where a known start shows the constant errors of the sensors."""
+        """Return the navigator at the start of a path, where a known start shows the constant errors of the sensors."""
         new = copy.deepcopy(self)
         new.left, new.course = reading.std, reading.heading
         if reading.known is not None and reading.known_std is not None:

@@ -34,9 +34,9 @@ USUAL: dict[str, Any] = {
     "drift": 0.03,  # of a log to 3 %, and a current of as much
     "wander_km": 0.1,
 }
-"""Rules of a vehicle, in place of those of :class:`~magrl.tracking.Rules` or of the training."""
+"""Rules of a vehicle, which replace the defaults of :class:`~magrl.tracking.Rules` and the training's."""
 LONGEST_WAY_KM = 2500.0
-"""Estimated way beyond which an agent without a map is out of range: there its observation of the way saturates."""
+"""Estimated distance beyond which an agent without a map is out of range: there its observation saturates."""
 HIGHEST_LATITUDE = 85.0
 """Latitude beyond which a known place is out of range: its region of 90 % held 78 % of the places at 86 to 88° S."""
 _UNCHECKED = {
@@ -51,14 +51,14 @@ class Onboard:
 
     :meth:`start` takes the elements at the destination. The first :meth:`step` takes the reading at the start, every
     later one what the vehicle did since the last step by its own log and compass, and the reading at the end of that
-    move. Each returns a :class:`Command`. A call that raises an error changes nothing: repeat it with right values.
+    leg. Each returns a :class:`Command`. A call that raises an error changes nothing: repeat it with right values.
 
     Args:
         navigator: ``"anywhere"`` for the pretrained agent, ``"kalman"``, or a file of
             :func:`~magrl.tracking.save_pilot`, which run without TorchRL; ``"secant"``, a file of
             :func:`magrl.save_policy`, a policy or a navigator, of which the vehicle gets a copy.
         options: those of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are those of the
-            training, but :data:`USUAL`. The limits of a move are at most those of the training.
+            training, but :data:`USUAL`. The limits of a leg are at most those of the training.
 
     Raises:
         ValueError: for an option out of its range, an unknown navigator, or one that reads more than the vehicle knows.
@@ -106,7 +106,7 @@ class Onboard:
         """Begin an episode to a destination, with what the vehicle knows.
 
         With a date, the vehicle carries a model of the Earth, by default the newest that ships with the library. Where
-        it also knows its place, it follows it along the way, and steers between places. Without a date, it knows
+        it also knows its place, it follows it along the path, and steers between places. Without a date, it knows
         nothing of the Earth but the spectrum of its field, as in the paper. Where the elements at the start are known,
         the first reading shows the constant errors of the sensors (:func:`magrl.tracking.known`). A first reading that
         does not fit the start raises an error.
@@ -164,21 +164,21 @@ class Onboard:
         distance_std: float = 0.0,
         heading_std: float = 0.0,
     ) -> Command:
-        """Return what to do after a move.
+        """Return what to do after a leg.
 
         An element that could not be read is None: the vehicle goes on by dead reckoning. From magnetic north, D is
-        always None, and the heading of a move is that at its start. A way that is longer than a
-        move is reported in parts, each but the last without a reading.
+        always None, and the heading of a leg is the heading at its start. A distance that is longer than a leg is
+        reported in parts, each but the last without a reading.
 
         Args:
-            declination: D at the end of the move [deg].
+            declination: D at the end of the leg [deg].
             inclination: I there [deg].
             horizontal_intensity: B_H there [nT].
-            heading: heading of the move [deg], -360 to 360; in the first step the heading at the start.
-            distance: length of the move [km]; 0 in the first step.
+            heading: heading of the leg [deg], -360 to 360; in the first step the heading at the start.
+            distance: length of the leg [km]; 0 in the first step.
             distance_std: standard deviation of that length [km], beside the drift of the options, such as that of an
                 inertial navigation system.
-            heading_std: the same of the heading of the move [deg].
+            heading_std: the same of the heading of the leg [deg].
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -199,7 +199,7 @@ class Onboard:
         counts from the next step on.
 
         Args:
-            latitude: of the vehicle at the end of the last move [deg].
+            latitude: of the vehicle at the end of the last leg [deg].
             longitude: the same [deg].
             std_km: root mean square error of the fix [km].
 
@@ -214,7 +214,7 @@ class Onboard:
         self._steps += (fix,)
 
     def _after(self, step: Step) -> Command:
-        """Return what to do after a new move."""
+        """Return what to do after a new leg."""
         read = self._comparable(step.elements)
         last = self._last or read
         elements: Any = tuple(old if new is None else new for new, old in zip(read, last, strict=True))
@@ -269,8 +269,8 @@ class Onboard:
         longest = self.options.max_move_km
         if step.distance > limits.LONGER * longest:
             raise ValueError(
-                f"distance {step.distance:g} km is longer than the longest move of this vehicle, {longest:g} km: it "
-                "must be in kilometers, and since the last step; report a longer way in parts, with None between"
+                f"distance {step.distance:g} km is longer than the longest leg of this vehicle, {longest:g} km: it "
+                "must be in kilometers, and since the last step; report a longer distance in parts, with None between"
             )
         if self._state is not None:
             since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
@@ -308,7 +308,10 @@ class Onboard:
             return "out of range", f"latitude {latitude:.1f}: the model is valid to {HIGHEST_LATITUDE:g} degrees"
         way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
         if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
-            return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
+            return (
+                "out of range",
+                f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}",
+            )
         if not decision.declare.item() or doubt.level > LOST_SURPRISE:
             return None, ""
         if decision.probability.item() >= options.confidence:
@@ -324,7 +327,7 @@ class Onboard:
         return None, ""
 
     def _lost(self, track: Track) -> str:
-        """Return why readings or moves cannot be those of a vehicle, as text; empty if they can."""
+        """Return why readings or legs cannot be those of a vehicle, as text; empty if they can."""
         useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
         unchanged = [km * use for km, use in zip(self._unchanged, useful, strict=True)]
