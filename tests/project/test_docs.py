@@ -37,7 +37,7 @@ BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
 SCRIPTS = [
     ROOT / "docs" / "examples" / name
-    for name in ("ddpg_anywhere.py", "navigator.py", "sac.py", "sb3_anywhere.py", "turns.py")
+    for name in ("ddpg_anywhere.py", "ins.py", "navigator.py", "sac.py", "sb3_anywhere.py", "turns.py")
 ]
 EXAMPLES += [(path, path.read_text(encoding="utf-8")) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
@@ -101,7 +101,8 @@ def reader(tmp_path_factory) -> Path:
 def test_python_examples_run_and_print_what_they_say(page: Path, code: str, reader: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(reader)
     said = re.findall(r"^ *print\(.*\)  # (?!about)(.*)", code, re.MULTILINE) if page in TEXTS else []
-    block = TEXTS.get(page, "").partition(f"{code}```\n\n```text\n")[2].partition("```")[0]
+    before = f"{code}```\n" if page in TEXTS else f"[{page.name}](examples/{page.name}) prints:\n"
+    block = "".join(TEXTS.values()).partition(f"{before}\n```text\n")[2].partition("```")[0]
     long = any(setting in code for setting in BUDGET) or "runs/first" in code
     monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
     if "stable_baselines3" in code:
