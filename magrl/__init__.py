@@ -1,7 +1,7 @@
 """Navigation by the Earth's magnetic field: a TorchRL environment, transforms and what trains on them.
 
 Importing the package registers the named tasks of :mod:`magrl.envs.gymnasium` with Gymnasium. The names in
-``magrl.__all__``, those of ``__init__.pyi``, are loaded when first used, so that the import does not load torch.
+``magrl.__all__``, listed in ``__init__.pyi``, are loaded when first used, so that the import does not load torch.
 """
 
 import multiprocessing as _multiprocessing

@@ -33,7 +33,7 @@ VEHICLES = ("aircraft", "ship", "underwater", "low-cost")
 DRIFT_KM = 40.0
 """How much farther than the longest leg errors may carry a vehicle [km], for one environment under all conditions."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
-"""Seed of regions and tasks, beyond those of trainings and of frozen sets."""
+"""Seed of regions and tasks, beyond the seeds of trainings and of frozen sets."""
 READINGS = (*PUBLIC_KEYS, "elapsed_steps")
 """Keys of the readings, without the accuracy of the sensors."""
 
@@ -66,9 +66,9 @@ class Track:
     north: str = "true"
     """North of the vehicles, ``"true"`` or ``"magnetic"``."""
     crust: bool = False
-    """Whether the field is that of WMMHR, with crust, in place of IGRF-14."""
+    """Whether the field is WMMHR, with crust, versus IGRF-14."""
     box: bool = False
-    """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
+    """Whether the tasks are in the paper's box, ``test-1000``, versus random regions."""
     date: str = "2025-01-01"
     """Date of IGRF-14 outside the paper's box."""
     seed: int = 0
@@ -101,8 +101,8 @@ class Track:
 
         Args:
             errors: of a level of :attr:`errors`.
-            tasks: tasks in place of those of the track.
-            changes: options of :class:`~magrl.evaluation.Flight` in place of those of the track.
+            tasks: tasks that replace the track's.
+            changes: options of :class:`~magrl.evaluation.Flight` that replace the track's.
         """
         scenario = self.scenario if tasks is None else self.scenario.with_tasks(tasks)
         options = {name: getattr(self, name) for name in ("north", "confidence", "seed")}
@@ -166,7 +166,7 @@ COLUMNS = {
     "false_arrival": bool,
     "final_distance_km": float,
 }
-"""Columns and their types. ``run`` counts the trainings of a navigator; ``seed`` is that of the errors."""
+"""Columns and their types. ``run`` counts the trainings of a navigator; ``seed`` is the seed of the errors."""
 
 
 def episode_table(measures: Mapping[str, Tensor], region: Tensor, **labels: str | int) -> pandas.DataFrame:

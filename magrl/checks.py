@@ -76,7 +76,7 @@ def require(good: Tensor, values: Tensor, message: str) -> None:
     Args:
         good: bool mask.
         values: values of the same shape.
-        message: message with ``{}`` in place of the first value that is not good.
+        message: message with ``{}`` for the first value that is not good.
 
     Raises:
         ValueError: with the message.
@@ -297,7 +297,7 @@ def short(value: object, length: int = 80) -> str:
 
 
 def printable(text: object) -> str:
-    r"""Return a text in one line, with escapes in place of control characters, which could rewrite what a user sees.
+    r"""Return a text in one line, with escapes for control characters, which could rewrite what a user sees.
 
     Example:
         >>> printable("a\x1b[2J\nb")
@@ -320,7 +320,7 @@ class UsageError(ValueError):
 def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> None:
     """Run a program from the command line.
 
-    What it prints is UTF-8 in every locale. A :class:`UsageError` and an :class:`OSError`, such as that of a full disk,
+    What it prints is UTF-8 in every locale. A :class:`UsageError` and an :class:`OSError`, such as of a full disk,
     are printed in one line, with exit status 2; Ctrl-C ends it with status 130. Where the reader of the output ends
     first, as in ``command --help | head``, the command ends without a message, with status 141, as after ``SIGPIPE``.
 

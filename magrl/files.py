@@ -54,7 +54,7 @@ def save_tensors(content: Any, path: Path) -> None:
     """Write tensors and plain data as one safetensors file, atomically.
 
     The metadata of the file holds the plain data as JSON, in which ``{"$tensor": name}`` stands for a tensor, and the
-    SHA-256 of the file with zeros in place of the digest.
+    SHA-256 of the file with zeros as the digest.
 
     Args:
         content: tensors, numbers, text, None, devices, and lists, tuples, dictionaries and state dictionaries of these.
@@ -264,7 +264,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def json_ready(value: Any) -> Any:
-    """Return numbers and texts with None in place of NaN and infinities, which JSON lacks, inside containers too.
+    """Return numbers and texts with None for NaN and infinities, which JSON lacks, inside containers too.
 
     Example:
         >>> json_ready({"runs": [{"steps": 9, "spl": math.nan}]})
@@ -342,7 +342,7 @@ def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
     Args:
         text: the table.
         separator: character between cells.
-        options: those of :func:`pandas.read_csv` for the values.
+        options: of :func:`pandas.read_csv` for the values.
 
     Raises:
         ValueError: for no row, too many columns or cells, two columns of one name, a row of more cells than the header,

@@ -103,7 +103,7 @@ def proximity_reward(
 ) -> Tensor:
     """Return the reward of Eq. 3-5: ``weight`` times the decrease of the objective in a step.
 
-    F has no upper bound: far from the destination, the reward of one leg exceeds that of the arrival many times.
+    F has no upper bound: far from the destination, the reward of one leg exceeds the arrival's many times.
 
     Args:
         objective_before: ``(...)`` F before the leg.
@@ -183,7 +183,7 @@ def parallel_approach(
     """Return the heading at which two elements approach their targets in proportion (Eq. 3-15, unambiguous).
 
     The paper's arctan of a quotient leaves two opposite headings. The intended one is the direction of
-    ``J^-1 (B_T - B)``; with the adjugate in place of the inverse it needs the sign of the determinant but no division.
+    ``J^-1 (B_T - B)``; with the adjugate instead of the inverse it needs the sign of the determinant but no division.
 
     Args:
         field: ``(..., 2)`` two elements at the vehicle.

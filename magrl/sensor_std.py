@@ -29,7 +29,7 @@ class SensorStd(NamedTuple):
     Args:
         noise: of errors that are new in each reading.
         bias: of all others. Infinite for D: the vehicle has no true north, and its headings are from magnetic north.
-        drift: of those that vary along the path or with the heading; at most ``bias``.
+        drift: of errors that vary along the path or with the heading; at most ``bias``.
         iron: of the part of them that is a constant field in the vehicle's axes: forward, right, down [nT].
 
     Example:
@@ -87,7 +87,7 @@ class SensorStd(NamedTuple):
         """Return the standard deviations of a reading, given those that are stated.
 
         Noise and bias are the larger of the stated ones and of those that come with the reading: during an outage, or
-        where readings show more noise, it is worse than stated. Drift and iron are those of the reading, if it comes
+        where readings show more noise, it is worse than stated. Drift and iron are the reading's, if it comes
         with them.
 
         Args:

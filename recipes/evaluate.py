@@ -10,12 +10,12 @@
     python recipes/evaluate.py sac.onnx secant                                  # a policy of another algorithm
 
 Trained agents are named by their run folders. By default, scenario, arrival threshold, start heading and sensor noise
-are those of the training, from the file of the policy. If the runs differ in one of these, give its option. A line
-below the table names the settings that an option overrides.
-Metaheuristics read the field at the end of every candidate leg for free (an oracle).
+are as in the training, from the file of the policy. If the runs differ in one of these, give its option. A line below
+the table names the settings that an option overrides. Metaheuristics read the field at the end of every candidate leg
+for free (an oracle).
 
-Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md and
-trajectories.png (the first tasks of each navigator).
+Prints the main measures. Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json,
+settings.json, table.md (all measures) and trajectories.png (the first tasks of each navigator).
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]
 
 
 def with_training_settings(config: Config) -> tuple[Config, list[str]]:
-    """Return the settings, where none were chosen those of the scenario or else of the trainings, and notes.
+    """Return the settings, where none were chosen the scenario's or else the trainings', and notes.
 
     Raises:
         ValueError: for trainings that differ in a setting that was not chosen.
@@ -142,7 +142,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
     """Make environments and navigators, and the folder of the results.
 
     Returns:
-        Settings with those of the trainings; flights of the tasks and of the example task; each navigator for both;
+        Settings with the trainings'; flights of the tasks and of the example task; each navigator for both;
         notes.
 
     Raises:
@@ -243,7 +243,7 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
 
 
 def write(config: Config, flight: Flight, results: Results, below: str) -> None:
-    """Write the files of the results; the text below is that of the table."""
+    """Write the files of the results; the text below is of the table."""
     env = flight.base.to("cpu")
     for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
         text = io.StringIO()

@@ -60,7 +60,7 @@ TRANSITION = (
 
 
 class Config(PlanetConfig):
-    """Settings of a training; the defaults are those of the preset."""
+    """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["far", "fast"] = "far"
     """Source of the defaults: destinations 150-1800 km away, or 300-500 km."""
@@ -96,7 +96,7 @@ PRESETS = {"far": FAR, "fast": FAST}
 
 
 def errors(config: Config, seed: int) -> list[Transform]:
-    """Return the drift and the noise of the sensors: that of the settings, or levels drawn for each episode."""
+    """Return the drift and the noise of the sensors: from the settings, or levels drawn for each episode."""
     levels = None if any(config.noise) else partial(sensor_levels, exponent=config.noise_exponent)
     return [*config.motion(seed), SensorErrors(config.noise, levels=levels, seed=seed)]
 
@@ -129,7 +129,7 @@ def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config
 
 
 def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> TensorDictSequential:
-    """Return the actor of the training: normal corrections around those of ``actor``, and the legs that follow."""
+    """Return the actor of the training: normal corrections around the ones of ``actor``, and the legs that follow."""
     network, corrected_move = actor.module
     drawn = make_drawn_correction(TensorDictModule(network.module, ["observation"], ["mean"]), spread)
     return TensorDictSequential(drawn, corrected_move)

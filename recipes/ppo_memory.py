@@ -51,7 +51,7 @@ SEQUENCE = ("observation", "hidden", "is_init", "true_way", "heading")
 
 
 class Config(PlanetConfig):
-    """Settings of a training; the defaults are those of the preset."""
+    """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["standard", "fast", "large"] = "standard"
     """Source of the defaults: ten million steps, one million, or a hundred million for a GPU."""
@@ -80,7 +80,7 @@ class Config(PlanetConfig):
     @model_validator(mode="after")
     def _of_the_task(self) -> Self:
         if any(self.noise) or self.drift:
-            raise ValueError(f"noise and drift are those of the task, got {self.noise} and {self.drift}")
+            raise ValueError(f"noise and drift are the task's, got {self.noise} and {self.drift}")
         return self
 
 

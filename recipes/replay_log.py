@@ -6,7 +6,7 @@
     python recipes/replay_log.py track.csv --north magnetic --noise 0 0.1 20     # as a vehicle without true north
 
 Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the heading [deg] and the length [km] of the leg
-since the row before; in the first row, the length is 0. The destination is that of the last row, unless --target gives
+since the row before; in the first row, the length is 0. The destination is the last row, unless --target gives
 its elements. With --north magnetic, D only converts the headings: the navigator gets I, B_H and headings from
 magnetic north, whatever the north of the log is. Where the log has positions, the estimates are compared with them; the
 navigator does not read them, but for the first one with --start-km.
@@ -60,11 +60,11 @@ class Config:
     navigator: str = "anywhere"
     """Navigator: anywhere (the pretrained agent), secant, kalman, or a policy file (.safetensors, .onnx)."""
     target: tuple[float, float, float] | None = None
-    """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
+    """Elements at the destination, D [deg], I [deg], B_H [nT]; by default from the last row."""
     target_position: tuple[float, float] | None = None
     """Latitude, longitude of the destination [deg], for comparison and --start-km; without --target the last ones."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicle: true (D is measured), or magnetic (it has a compass, and D tells nothing)."""
+    """North of the vehicle: true (D is measured), or magnetic (it has a compass, and D is not used)."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -76,7 +76,7 @@ class Config:
     date: str | None = None
     """Date of the log, for IGRF; by default from the column of the time, if it has dates."""
     start_km: float | None = None
-    """Accuracy of the first position [km]: the navigator then knows this one, and that of the destination."""
+    """Accuracy of the first position [km]: the navigator then knows this one, and the destination's."""
     model: str = "IGRF-14"
     """Model of the Earth that it then carries."""
     time: str = "time"
@@ -140,7 +140,7 @@ def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.Dat
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
     board, magnetic = started(config, log, date), config.north == "magnetic"
-    commands, north = [], log["D"].shift(1, fill_value=log["D"][0]) * magnetic  # of headings, from that of the log
+    commands, north = [], log["D"].shift(1, fill_value=log["D"][0]) * magnetic  # of headings, from the log's
     for (_, row), east in zip(log.iterrows(), north, strict=True):
         heading = math.remainder(row["heading"] - east, 360)
         try:

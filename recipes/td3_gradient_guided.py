@@ -52,7 +52,7 @@ ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
 class Config(RunConfig):
-    """Settings of a training; the defaults are those of the preset."""
+    """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
     """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance; nogo for the task."""

@@ -76,7 +76,7 @@ class OnnxNetwork(nn.Module):
 
 
 def with_description(content: bytes, description: Mapping[str, Any]) -> bytes:
-    """Return an ONNX file whose metadata describe its policy, without those of PyTorch on where it was exported."""
+    """Return an ONNX file whose metadata describe its policy, without PyTorch's metadata on where it was exported."""
     onnx = _library("onnx")
     model = onnx.load_model_from_string(content)
     for part in (model.graph, *model.functions):

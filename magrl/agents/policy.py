@@ -248,7 +248,7 @@ def save_policy(
         policy = export_policy(policy, view, memory)
     network, config = isinstance(policy.actor, OnnxNetwork), asdict(policy.config)
     if network != (Path(path).suffix == ".onnx"):
-        kind = "an exported network ends with .onnx, that of another policy does not"
+        kind = "an exported network ends with .onnx, another policy does not"
         raise ValueError(f"the file of {kind}, got {str(path)!r}")
     config["kind"] = next(name for name, kind in VIEWS.items() if isinstance(policy.view, kind))
     if network:

@@ -54,7 +54,7 @@ def _bound(spec: TensorSpec, end: str) -> Tensor:
 
 
 def _observation_space(env: TransformedEnv, keys: tuple[str, ...], *, flat: bool) -> spaces.Space[Any]:
-    """Return the space of one vehicle's observation; its bounds are those of the specs."""
+    """Return the space of one vehicle's observation; its bounds are the specs' bounds."""
     spec = env.observation_spec
     if missing := [key for key in keys if key not in spec.keys()]:  # noqa: SIM118 - a Composite is no mapping
         raise ValueError(f"observation names {missing[0]!r}, which is not among the keys {sorted(spec.keys())}")
@@ -81,14 +81,14 @@ _SPEC: Any = property(lambda env: getattr(env, "limited_spec", None), _keep_spec
 class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
 
-    All move in one batched step. The autoreset modes are those of Gymnasium. With ``NEXT_STEP``, the step after the end
+    All move in one batched step. The autoreset modes are Gymnasium's. With ``NEXT_STEP``, the step after the end
     of an episode starts the next, whatever the action; with ``DISABLED``, ``reset(options={"reset_mask": ended})``.
     In both, ``info`` has the measures and their masks. With ``SAME_STEP``, the next episode starts in the step in which
     one ends: the observation returned is the first of the new episode, ``info["final_obs"]`` the last of the old one
     and ``info["final_info"]`` its measures, each with its mask ``_final_obs``, ``_final_info``.
 
     ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
-    its own episodes; those of row 0 are the ones of the single environment.
+    its own episodes; row 0 has the episodes of the single environment.
 
     Args:
         num_envs: vehicles in the batch.
@@ -96,7 +96,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         autoreset_mode: mode, or its value: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         max_episode_steps: Gymnasium's name of ``max_steps``.
         task: name of the task in :data:`magrl.envs.navigation.NAMED_ENVS`, which an id sets.
-        **options: of the function there, all of which take those of :func:`magrl.envs.navigation.navigation_env`.
+        **options: of the function there, all of which take the options of :func:`magrl.envs.navigation.navigation_env`.
 
     Raises:
         TypeError, ValueError: for a bad option, as that function.
@@ -171,7 +171,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
             actions: ``(N, 2)`` distance and turn, in [-1, 1] or in km and rad.
 
         Raises:
-            gymnasium.error.ResetNeeded: before the first reset; without autoreset, before that of a vehicle that ended.
+            gymnasium.error.ResetNeeded: before the first reset; without autoreset, also after the end of an episode.
             ValueError: for actions of another shape, not real numbers, not finite, or out of their bounds.
         """
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
@@ -235,7 +235,7 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         render_mode: None, or ``"rgb_array"``: the track over the field's contours, ``(700, 700, 3)`` uint8.
-        **options: of :class:`GeomagneticNavVectorEnv`: those of the task, with ``task``.
+        **options: of :class:`GeomagneticNavVectorEnv`; with ``task``, options of the task.
 
     Raises:
         TypeError, ValueError: for a bad option, as there.

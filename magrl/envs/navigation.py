@@ -173,7 +173,7 @@ def _observation(env: TransformedEnv, observation: str | Sequence[str]) -> list[
 
 
 def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:
-    """Yield transforms, those of a ``Compose`` one by one."""
+    """Yield transforms, the parts of a ``Compose`` one by one."""
     for transform in transforms:
         yield from _parts(transform) if isinstance(transform, Compose) else (transform,)
 
@@ -216,7 +216,7 @@ def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = Fals
 
     Args:
         record: another record of the weather.
-        stated: whether the vehicle knows the size of each error, beside that of the white noise.
+        stated: whether the vehicle knows the size of each error, beside the white noise.
 
     Example:
         >>> [type(error).__name__ for error in storm_errors()]

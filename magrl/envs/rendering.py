@@ -1,6 +1,6 @@
 """Maps: contours of a field and the tracks of vehicles over them, drawn with matplotlib.
 
-Importing this module does not import matplotlib; drawing does. Colors are those of Okabe and Ito, which remain distinct
+Importing this module does not import matplotlib; drawing does. Colors are from Okabe and Ito, which remain distinct
 under color-vision deficiency.
 """
 

@@ -46,7 +46,7 @@ class BatchedVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Start an episode of every vehicle; after ``seed(s)``, those of that one seed."""
+        """Start an episode of every vehicle; after ``seed(s)``, the episodes of that seed."""
         observations, _ = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()

@@ -175,7 +175,7 @@ def _mean_changes(field: FieldModel | FieldBank, region: Regions) -> Tensor:
 
 
 class Scenario(CheckedModel):
-    """Where tasks lie, the field there, and how far apart their ends are; by default those of the paper.
+    """Where tasks lie, the field there, and how far apart their ends are; by default the paper's.
 
     From ``max_steps`` on, the fields are the rules of an episode.
 
@@ -212,10 +212,10 @@ class Scenario(CheckedModel):
     """Least differences of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by, or None for the mean change of each over
     :data:`FLOOR_KM` in the region. Where the field is steep, floors that are too low make every detour very costly."""
     field: Annotated[Any, BeforeValidator(_field)] = None
-    """Field model (:class:`magrl.field.FieldModel`) in place of IGRF; over many regions a
+    """Field model (:class:`magrl.field.FieldModel`) instead of IGRF; over many regions a
     :class:`magrl.field.FieldBank` with an expansion for each, of every place that a vehicle can reach."""
     tasks: Annotated[Tasks | None, BeforeValidator(_tasks)] = None
-    """Frozen tasks to fly in place of random ones; by default in region 0."""
+    """Frozen tasks to fly instead of random ones; by default in region 0."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     """Names of the frozen tasks, or none."""
     max_steps: Annotated[int, Field(ge=1, le=10**9)] = 50
@@ -382,7 +382,7 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
 
     Args:
         path: file that ends in ``.toml`` or ``.json``.
-        **changes: fields of :class:`Scenario` that replace those of the file.
+        **changes: fields of :class:`Scenario` that replace the file's.
 
     Raises:
         FileNotFoundError: if it does not exist.

@@ -61,7 +61,7 @@ class Limits(NamedTuple):
 
     @property
     def displacement(self) -> Bounded:
-        """Spec of a displacement from the end of a commanded leg to that of a true one [km]."""
+        """Spec of a displacement from the end of a commanded leg to the end of the true one [km]."""
         reach = 2 * self.max_move_km + self.drift_km
         return Bounded(-reach, reach, (2,), dtype=torch.float64)
 

@@ -231,7 +231,7 @@ def check_tasks(tasks: Tasks, within: Regions) -> Tasks:
 
     Args:
         tasks: ``M`` tasks.
-        within: boxes, of which that of a task must hold its start and target.
+        within: boxes; the box of a task must hold its start and target.
 
     Raises:
         TypeError: for a region index that is not int64.

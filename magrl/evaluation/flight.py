@@ -33,8 +33,8 @@ class Flight:
         scenario: scenario.
         errors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real vehicle:
             :class:`~magrl.transforms.Conditions`, a name of :data:`magrl.transforms.CONDITIONS`, or a file of
-            conditions (:func:`magrl.transforms.load_conditions`). The stated weather is that of the longest distance of
-            the scenario.
+            conditions (:func:`magrl.transforms.load_conditions`). The stated weather is for the longest distance of the
+            scenario.
         north: ``"true"``, or ``"magnetic"`` for vehicles that have no true north: they measure I and B_H, and steer by
             their compass (:class:`magrl.transforms.MagneticNorth`), whatever ``errors`` say of a north reference.
         model: model of the Earth that the vehicles carry, as of the date of the scenario

@@ -1,6 +1,6 @@
 """Maps of episodes over contours of the field: figures, and an animated GIF.
 
-The coastlines are those of Natural Earth 4.1.0, physical vectors "Land" at 1:50 million, which are in the public domain
+The coastlines are from Natural Earth 4.1.0, physical vectors "Land" at 1:50 million, which are in the public domain
 (https://www.naturalearthdata.com). They were taken from ``land-50m.json`` of the npm package world-atlas 2.0.2, cut at
 the antimeridian, simplified to 0.04 degree (Douglas and Peucker), and rounded to 0.01 degree; islands smaller than 0.2
 degree are left out.
@@ -40,7 +40,7 @@ FRAME_MS, LAST_FRAME_MS, GIF_COLORS = 150, 1280, 256
 WAY = ("track", "way")
 """Key of the estimated displacement of a :class:`~magrl.transforms.TrackField`."""
 _DRAWN = PIECES // 2  # a frame at every second piece of a leg
-_FARTHEST = 1.3  # distance of an estimate, over that of the task, up to which the map of an animation holds it
+_FARTHEST = 1.3  # distance of an estimate, over the task's distance, up to which the map of an animation holds it
 
 
 @cache

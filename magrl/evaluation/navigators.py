@@ -139,8 +139,8 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
 
     Args:
         texts: navigators, as :func:`make_navigator` takes them.
-        chosen: settings that override those of the trainings: ``scenario``, ``zeta``, ``start_heading``, ``errors``;
-            None for those of the trainings.
+        chosen: settings that override the trainings': ``scenario``, ``zeta``, ``start_heading``, ``errors``;
+            None for the trainings' settings.
 
     Returns:
         Settings; those without a value in ``chosen`` and in any training are left out.
@@ -224,7 +224,7 @@ def fitted(policy: TensorDictModuleBase, env: GeomagneticNavEnv, **rules: Any) -
     """Return a policy within the limits of an environment, which declares its arrival where it must.
 
     Args:
-        policy: any; those of the library say themselves how they fit (:meth:`Navigator.fitted`).
+        policy: any; the library's policies say themselves how they fit (:meth:`Navigator.fitted`).
         env: environment.
         **rules: further :class:`~magrl.tracking.Rules`, such as ``confidence``.
     """

@@ -13,12 +13,12 @@ from magrl.envs.tasks import RANDOM_SETS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
-"""Seed of random tasks with --tasks-seed 0: beyond those of trainings and of frozen sets."""
+"""Seed of random tasks with --tasks-seed 0: beyond the seeds of trainings and of frozen sets."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioOptions:
-    """Keys of a scenario that a command line can change; None for those of the file, or the defaults.
+    """Keys of a scenario that a command line can change; None for the file's values, or the defaults.
 
     Example:
         >>> ScenarioOptions(max_steps=80).changes()
@@ -26,9 +26,9 @@ class ScenarioOptions:
     """
 
     zeta: float | None = None
-    """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
+    """Arrival threshold on the objective (Eq. 2-7); by default the runs' threshold, or 0.01 without runs."""
     start_heading: Literal["north", "random"] | None = None
-    """Heading at the start of an episode; by default that of the runs, or north."""
+    """Heading at the start of an episode; by default as in the runs, or north."""
     arrival: Literal["objective", "distance", "declared"] | None = None
     """Rule of arrival: F below --zeta (default), distance below --radius-km, or a declaration by the navigator."""
     radius_km: float | None = None

@@ -53,7 +53,7 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
             ``"nogo"``.
         episodes: vehicles, each with one episode.
         seed: seed of the episodes; the default is reserved for evaluations.
-        options: of the function there. The score is then not that of the task.
+        options: of the function there. The score is then not the task's.
 
     Returns:
         ``SR``, success rate [%]; ``SPL`` [%] with its bootstrap 95 % interval over episodes, ``SPL_low`` and

@@ -21,7 +21,7 @@ class FieldBank(Float64Module):
 
     Each position comes with the index of its expansion, so a batch of vehicles can be spread over many planets. An
     evaluation sums the coefficients of each vehicle over the polynomials of its latitude, without a copy of them, then
-    over those of its longitude. :meth:`build` makes a bank from Gauss coefficients. A bank of one box is a
+    over polynomials of its longitude. :meth:`build` makes a bank from Gauss coefficients. A bank of one box is a
     :class:`~magrl.field.RegionalField`.
 
     Args:

@@ -119,7 +119,7 @@ class IGRF(SphericalHarmonicField):
     Args:
         date: ``datetime``, ``date``, ``numpy.datetime64``, ISO text or decimal year, from 1900.0 to the end of the
             generation.
-        generation: 13 (to 2025) or 14 (to 2030). The paper's figures are those of 13 at 2022-01-01.
+        generation: 13 (to 2025) or 14 (to 2030). The paper's figures have generation 13 at 2022-01-01.
         altitude_km: default height above the ellipsoid [km], from -15 (15 km deep) to 1000.
 
     Raises:

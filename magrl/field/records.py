@@ -1,6 +1,6 @@
 """Magnetic weather: how the field varies in time, from one-minute records of magnetic observatories.
 
-The records are those of the U.S. Geological Survey (USGS) that come with its program geomag-algorithms
+The records are from the U.S. Geological Survey (USGS) that come with its program geomag-algorithms
 (https://github.com/usgs/geomag-algorithms), which is in the public domain (CC0 1.0). ``weather.npz`` holds them as
 variations northward, eastward and downward, in tenths of a nanotesla. The level from which they vary is the median of
 each component over the quietest day of the record, the day (UTC) on which the horizontal intensity has the least range.
@@ -13,7 +13,7 @@ Boulder, 1-7 November 2014    etc/iaga2002/BOU/OneMinute/bou2014110?vmin.min (28
 College, 1 March 2020         etc/prepfiles/CMO2020061.min (b28cf65)                 H, E, Z of the variometer
 ============================  =====================================================  ===============================
 
-A variometer's own axes are turned to geographic ones so that the declination of the quiet level is that of IGRF at the
+A variometer's own axes are turned to geographic ones so that the declination of the quiet level is IGRF's at the
 station. An axis that is off by 1 degree changes a variation of 100 nT by 2 nT. No minute of these files is missing.
 """
 
@@ -40,7 +40,7 @@ class WeatherRecord:
     Args:
         variation: ``(T, 3)`` north, east, down [nT], one row a minute; NaN marks a gap.
         first: first minute at which an episode may start.
-        last: last minute at which one may start; by default that of the record.
+        last: last minute at which one may start; by default the record's last.
         name: name for messages.
 
     Raises:

@@ -18,9 +18,9 @@ from magrl.geodesy import check_box, curvature_radii
 class RegionalField(Float64Module):
     """A field model on a latitude-longitude box, as a two-dimensional Chebyshev expansion.
 
-    Value and gradient take one small matrix product over the polynomials of the latitude and one sum over those of the
-    longitude. The constructor compares the expansion with the model at points between the nodes and raises if the error
-    is above the tolerance.
+    Value and gradient take one small matrix product over the polynomials of the latitude and one sum over polynomials
+    of the longitude. The constructor compares the expansion with the model at points between the nodes and raises if
+    the error is above the tolerance.
 
     Args:
         model: field model to expand.

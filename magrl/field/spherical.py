@@ -81,7 +81,7 @@ class SphericalHarmonicField(Float64Module):
     ) -> tuple[Tensor, Tensor]:
         """Return the field vector and its exact horizontal gradient.
 
-        The gradient is that of the local components, so it contains the rotation of the local axes. Its east column
+        The gradient is of the local components, so it contains the rotation of the local axes. Its east column
         grows without bound at a geographic pole, where the direction of north rotates.
 
         Args:

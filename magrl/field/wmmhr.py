@@ -1,7 +1,7 @@
-"""The World Magnetic Model High Resolution 2025: the field of the core, and from degree 16 to 133 that of the crust.
+"""The World Magnetic Model High Resolution 2025: the field of the core, and from degree 16 to 133 of the crust.
 
 The coefficients ``wmmhr2025.cof.gz`` are the file ``WMMHR.COF`` of 2024-11-13, by NOAA NCEI and the British Geological
-Survey, in the public domain, from the package wmmhr 1.2.4 on PyPI; :data:`WMMHR_SHA256` is that of the file.
+Survey, in the public domain, from the package wmmhr 1.2.4 on PyPI; :data:`WMMHR_SHA256` is the file's digest.
 
 Source: NOAA NCEI Geomagnetic Modeling Team and British Geological Survey, World Magnetic Model High Resolution 2025
 (2024), doi:10.25921/qb1c-vn52.
@@ -41,7 +41,7 @@ def _wmmhr_tables() -> tuple[Tensor, Tensor]:
 
 
 def wmmhr_coefficients(date: Date) -> Tensor:
-    """Return the Gauss coefficients of WMMHR-2025 at a date: those of its epoch, 2025.0, and their rates.
+    """Return the Gauss coefficients of WMMHR-2025 at a date, from its epoch, 2025.0, and their rates.
 
     Degrees 1 to 15 are of the core and change at a constant rate; degrees 16 to 133 are of the crust and are constant.
 
@@ -87,7 +87,7 @@ class WMMHR(SphericalHarmonicField):
         ValueError: for a date outside the model, with the valid span, or an altitude below the model.
 
     Source:
-        NOAA NCEI and British Geological Survey, doi:10.25921/qb1c-vn52. Its crust is that of the model MF7, from data
+        NOAA NCEI and British Geological Survey, doi:10.25921/qb1c-vn52. Its crust is the model MF7, from data
         of the satellite CHAMP.
 
     Example:

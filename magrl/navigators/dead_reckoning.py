@@ -24,7 +24,7 @@ class DeadReckoning(Navigator):
     """Steer to the coordinates of the destination by the reckoned place alone; the field is not read.
 
     What every vehicle with a known start does without this library. Where the environment has no
-    :class:`~magrl.transforms.KnownPlace`, start and destination are those of the environment, without an error.
+    :class:`~magrl.transforms.KnownPlace`, start and destination are the environment's, without an error.
     Headings from magnetic north are corrected by the declination of a chart at the reckoned place, if it has one. Where
     the arrival must be declared, it declares at the reckoned destination.
 

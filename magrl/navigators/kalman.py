@@ -107,7 +107,7 @@ class Anywhere(Kalman):
     """The agent that corrects the plan of :class:`Kalman` by a network, which was trained on random planets.
 
     Args:
-        rules: as of :class:`Kalman`; those of the training by default.
+        rules: as of :class:`Kalman`; the training's by default.
         source: file of :func:`magrl.tracking.save_pilot`, or a network from the observation to a correction; the
             pretrained agent by default.
         changes: values of :class:`~magrl.tracking.Rules` that replace those.

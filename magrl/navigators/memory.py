@@ -82,7 +82,7 @@ class Memory(Navigator):
 
     Args:
         source: file of :meth:`save`, or a :class:`MemoryNetwork`; the pretrained agent by default, of *Storm*.
-        limits: longest leg [km] and largest turn [rad]: at most those of the training.
+        limits: longest leg [km] and largest turn [rad]: at most the training's limits.
 
     Raises:
         FileNotFoundError: for a missing file.

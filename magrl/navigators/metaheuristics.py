@@ -83,7 +83,7 @@ class Metaheuristic(Navigator):
     """Base class of the metaheuristics: individuals as legs, the search for the best, random numbers.
 
     A subclass initializes its state (:meth:`begin`) and computes the next generation (:meth:`evolve`). The defaults of
-    the options are from a sweep: those of the highest SPL, or with a third of the readings for 0.1 % less.
+    the options are from a sweep: with the highest SPL, or with a third of the readings for 0.1 % less.
 
     Args:
         field: field model.

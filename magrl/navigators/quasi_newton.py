@@ -87,7 +87,7 @@ def next_track(
 ) -> FieldTrack:
     """Return the state after a leg and the reading at its end.
 
-    The gradient drifts with the path: with the curvature c, its variance grows by ``c^2 |d|^2``, that of the value by
+    The gradient drifts with the path: with the curvature c, its variance grows by ``c^2 |d|^2``, the value's by
     ``c^2 |d|^4 / 4``, and their covariance by ``c^2 |d|^2 d / 2``.
 
     Args:
@@ -396,7 +396,7 @@ class Secant(QuasiNewton):
     Args:
         max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
-        probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest leg.
+        probe_km: length of the two legs [km]; for None :func:`probe_length`, at most the longest leg.
         elements: all three by default, each weighted by how well it determines the displacement; or two of them.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         **options: ``zeta`` and ``search`` of :class:`QuasiNewton`.

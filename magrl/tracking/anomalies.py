@@ -10,7 +10,7 @@ All beliefs share one reference place: their estimates of the place differ by th
 
 Source:
     D. T. Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Transactions on Automatic Control 10
-    (1965). The weights change between readings as those of H. A. P. Blom and Y. Bar-Shalom, The interacting multiple
+    (1965). The weights change between readings as in H. A. P. Blom and Y. Bar-Shalom, The interacting multiple
     model algorithm, IEEE Transactions on Automatic Control 33 (1988); the beliefs do not.
 """
 
@@ -48,7 +48,7 @@ def crust_correlation(square: Tensor) -> Tensor:
 
 
 def crust_share(field: Tensor, errors: SensorStd, crust_nt: Tensor) -> Tensor:
-    """Return the share ``(..., 3, 3)`` of an anomaly that is the field of the crust; arguments as those of
+    """Return the share ``(..., 3, 3)`` of an anomaly that is the field of the crust; arguments as of
     :func:`lasting_covariances`."""
     variance = crust_nt.square()[..., None, None]
     anomaly = lasting_covariances(field, errors, crust_nt)[1]
@@ -75,7 +75,7 @@ def side_by_side(belief: Belief, errors: SensorStd) -> Belief:
     """Return a belief before its first reading once for each size of the anomaly.
 
     Args:
-        belief: without an anomaly but that of the stated errors.
+        belief: without an anomaly but the stated errors.
         errors: accuracy of the readings, tensors ``(..., 3)``.
 
     Returns:

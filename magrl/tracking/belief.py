@@ -2,12 +2,12 @@
 
 The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.tracking.harmonics`, the first
 three are the field itself), a magnetic anomaly, the error of the estimated place, the drift of dead reckoning, and the
-errors of the readings: constant ones of D, I, B_H, and a field that turns with the vehicle, such as that of hard iron.
-The anomaly is the field of the crust and of magnetic weather, three components that vary along the path as a
-first-order Gauss-Markov process. Where the place is not known, its error northward is that of the latitude, which is
+errors of the readings: constant ones of D, I, B_H, and a field that turns with the vehicle, such as by hard iron. The
+anomaly is the field of the crust and of magnetic weather, three components that vary along the path as a first-order
+Gauss-Markov process. Where the place is not known, its error northward is the error of the latitude, which is
 dead-reckoned (true north turns along the path, by tan(latitude) / R for each kilometer eastward). Where it is known,
 and with it a model of the Earth, the coefficients stay those at the true place, and a leg changes them as the model
-does, but for their difference from it (:class:`Motion`). Both steps are those of a Kalman filter:
+does, but for their difference from it (:class:`Motion`). Both steps are a Kalman filter's:
 
 - A leg along a great circle is linear in the coefficients, c' = Turn(gamma) exp(X) c, where X = n (d_x + T_N / M) + e
   (d_y + T_E / N) has the generators of translations, with the degrees above 3 as their regression, and of the turns of
@@ -16,7 +16,7 @@ does, but for their difference from it (:class:`Motion`). Both steps are those o
   the Jacobian at the reading. So nothing is linearized but errors.
 
 A vehicle that has no north reference but its compass measures I and B_H, and its headings are from magnetic north. Its
-axes are those of magnetic north where it is: the field has no eastward part there, exactly. They are turned after each
+axes are from magnetic north where it is: the field has no eastward part there, exactly. They are turned after each
 leg by how much D has changed along it, as the belief expects; the latitude is not known (NaN) and not needed.
 
 All functions batch over leading dimensions.
@@ -109,7 +109,7 @@ class Belief(NamedTuple):
 
     @property
     def magnetic(self) -> Tensor:
-        """Whether the axes are those of magnetic north ``(...)``."""
+        """Whether the axes are from magnetic north ``(...)``."""
         return self.latitude.isnan()
 
     @property
@@ -210,7 +210,7 @@ def at_place(place: Tensor, place_km: float, errors: SensorStd, motion: Motion) 
 
 
 def _with_errors(mean: Tensor, covariance: Tensor, place: Tensor, errors: SensorStd) -> Belief:
-    """Return a belief whose first states have a mean and a covariance, and the others those of the sensors."""
+    """Return a belief whose first states have a mean and a covariance, and the others the sensors'."""
     constant, anomaly, iron = (
         kind.expand(*mean.shape[:-1], 3, 3) for kind in lasting_covariances(mean[..., :3], errors)
     )
@@ -279,7 +279,7 @@ def moved(
 def _moved_by_model(
     belief: Belief, after: Belief, matrix: Tensor, spread: Tensor, distance: Tensor, course: Tensor, motion: Motion
 ) -> Belief:
-    """Return the belief after a leg where the place is known: coefficients change as those of the model do at the
+    """Return the belief after a leg where the place is known: coefficients change as the model's do at the
     estimated place, and their difference from the model as any field does.
 
     With the model's coefficients m and their slopes J before the leg, m' and J' after it, the turn and translation M,
@@ -347,7 +347,7 @@ def innovation(
     heading: Tensor | None = None,
     errors: bool = True,
 ) -> Innovation:
-    """Return a reading minus what the belief predicts; arguments as those of :func:`read`.
+    """Return a reading minus what the belief predicts; arguments as of :func:`read`.
 
     Args:
         belief: that before the reading.

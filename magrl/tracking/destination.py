@@ -4,9 +4,9 @@ At a displacement d along a great circle, the field is linear in the coefficient
 (:func:`~magrl.tracking.harmonics.field_rows`, with the higher degrees as their regression). It is given in axes that
 are carried along the great circle; north there differs from theirs by the angle gamma(d) of the meridians, by which the
 vector of the destination's elements is turned back, and the vertical on the ellipsoid by a small angle more. The
-posterior's density is that of the vector under the normal distribution of the predicted field, times a normal prior of
-the displacement. It may have long tails and several maxima, so it is evaluated at points of two densities: around its
-mode, and around the vehicle at all distances.
+posterior's density is the density of the vector, under the normal distribution of the predicted field, times a normal
+prior of the displacement. It may have long tails and several maxima, so it is evaluated at points of two densities:
+around its mode, and around the vehicle at all distances.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RANGE_KM = 400.0
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out; none is farther
 _ELSEWHERE_LOG = -39.0  # its log density: e^-7, over the volume of all fields on the Earth [nT^3]
 _SLACK_NT = 100.0  # deviation of the field at the mode within which a destination is in reach
-_SPREAD = 1.5  # standard deviations of the points around the mode, over those of the mode
+_SPREAD = 1.5  # standard deviations of the points around the mode, over the mode's
 _LEAST_NT = 1.0  # horizontal field whose direction is north
 _LEAST_KM = 0.1  # standard deviation of the points around the mode
 _LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
@@ -50,7 +50,7 @@ class Destination(NamedTuple):
             too, is part of the field.
         field: ``(..., 3)`` at the destination, in the axes there.
         range: prior standard deviation of the displacement along each axis.
-        noise: ``(...)`` variance of the field in each axis that the belief does not know, that of the given elements.
+        noise: ``(...)`` variance of the field in each axis that the belief does not know: of the given elements.
         crust: ``(...)`` standard deviation of the crust's field in each axis.
         share: ``(..., 3, 3)`` of the anomaly that is crust; 0 between places.
         between: displacement between the places of vehicle and destination, where both are known.
@@ -188,8 +188,8 @@ def mode(goal: Destination) -> Way:
 def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
     """Return the posterior of the displacement to a destination, in single precision.
 
-    A quarter of the points are around the mode, the others around the vehicle; each has the density over that of all
-    points there as its weight.
+    A quarter of the points are around the mode, the others around the vehicle; the weight of each is the density over
+    the density of all points there.
 
     Args:
         goal: the destination.
@@ -292,7 +292,7 @@ def _state(belief: Belief) -> Tensor:
 
 @constant
 def _around(count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance those of the
+    """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance the rows of the
     upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``, and where these are in it, flattened."""
     points = unit_points(count)[1] / UNIT_KM
     lever = torch.tensordot(powers(points, HIGHEST), monomial_rows(HIGHEST), 1)  # (M, 3, K)
@@ -339,7 +339,7 @@ def _without_declination(
     goal: Destination, residual: Tensor, covariance: list[Tensor], mean: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
     """Return a residual ``(..., 3, M)`` and its covariance along the predicted magnetic north and downward, where the
-    belief's axes are those of magnetic north: D of the destination is then not comparable.
+    belief's axes are from magnetic north: D of the destination is then not comparable.
 
     The second of the axes is left with a residual of 0.
     """
@@ -415,7 +415,7 @@ _MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest 
 def unit_points(count: int) -> tuple[Tensor, Tensor]:
     """Return quasi-random points: a quarter of a standard normal, and the others around the vehicle [km].
 
-    The density of those is that of the inverse square of the distance, and constant within the nearest.
+    Their density is the inverse square of the distance, and constant within the nearest.
     """
     first = torch.quasirandom.SobolEngine(2, scramble=True, seed=0).draw(count // 4, dtype=torch.float64)
     second = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count - count // 4, dtype=torch.float64)

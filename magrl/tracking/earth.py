@@ -86,7 +86,7 @@ class EarthModel:
         Each is a normal distribution as wide as its share of the surface.
 
         Args:
-            magnetic: whether axes are those of magnetic north.
+            magnetic: whether axes are from magnetic north.
         """
         if magnetic not in self._cells:
             self._cells[magnetic] = self._make_cells(magnetic)

@@ -24,7 +24,7 @@ def covariance_after(
     """Return the expected covariance ``(..., M, 2, 2)`` of the displacement [km^2] after legs with readings at the end.
 
     The covariance of the predicted field at a place, after a reading, does not depend on what will be read. Its slopes
-    there, which divide a difference of the field, do: their mean square is that of the present estimate plus what the
+    there, which divide a difference of the field, do: their mean square is the present estimate's plus what the
     reading will take from their covariance.
 
     Args:
@@ -77,7 +77,7 @@ def covariance_after(
 def _between_after(
     goal: Destination, between: Way, moves: Tensor, errors: SensorStd, readings: Tensor | float
 ) -> Tensor:
-    """Return :func:`covariance_after` where the displacement is that between two known places: that of the place."""
+    """Return :func:`covariance_after` between two known places, whose displacement has the place's covariance."""
     reading, noise = _readings(goal, moves, errors, readings)
     covariance = goal.belief.covariance.unsqueeze(-3)
     far = moves.norm(dim=-1)[..., None, None] * UNIT_KM
@@ -91,7 +91,7 @@ def _between_after(
 
 def _comparable(goal: Destination, rows: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """Return rows ``(..., M, 3, K)`` of the field at places and residuals ``(..., M, 3)`` along the predicted magnetic
-    north and downward, where the belief's axes are those of magnetic north: D there is not comparable."""
+    north and downward, where the belief's axes are from magnetic north: D there is not comparable."""
     field = (rows @ goal.belief.mean[..., None, : rows.shape[-1], None]).squeeze(-1)
     north, east, _ = field.unbind(-1)
     level = torch.hypot(north, east)

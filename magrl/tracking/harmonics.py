@@ -6,9 +6,10 @@ psi is a sum of solid harmonics in local Cartesian axes, x northward, y eastward
     rho = 2 Re R_n^m, 2 Im R_n^m (m > 0), R_n^0,    R_n^m = r^n P_nm(cos theta) e^{i m lambda} / (n + m)!
 
 with the Legendre functions P_nm of geomagnetism (no Condon-Shortley phase) and theta from the z axis. Its coefficients
-are ordered by degree n, and in each degree by falling order m. Those of degree 1 belong to x, y, z: they are the field
-itself, north, east, down. A constant is left out. Derivatives of a harmonic function and its rotations are harmonic, so
-both are matrices on the coefficients; with lengths in units of 1000 km, the coefficients are in nT per unit^(n - 1).
+are ordered by degree n, and in each degree by falling order m. Coefficients of degree 1 belong to x, y, z: they are the
+field itself, north, east, down. A constant is left out. Derivatives of a harmonic function and its rotations are
+harmonic, so both are matrices on the coefficients; with lengths in units of 1000 km, the coefficients are in nT per
+unit^(n - 1).
 
 In this normalization derivatives have the weights 1 and -1, and rotations are ladders:
 
@@ -85,7 +86,7 @@ def orders(degree: int) -> list[tuple[int, int]]:
 class Generators(NamedTuple):
     """Matrices ``(3, K, K)`` on the coefficients: the derivatives along x, y and z, and the turns of the axes.
 
-    The turns are those of a vehicle on a unit sphere that moves north (x d_z - z d_x) or east (y d_z - z d_y), and that
+    The turns are of a vehicle on a unit sphere that moves north (x d_z - z d_x) or east (y d_z - z d_y), and that
     of axes whose azimuths become larger (y d_x - x d_y), all per radian.
 
     Example:
@@ -200,7 +201,7 @@ def arc(sin: Tensor, cos: Tensor, north: Tensor, east: Tensor) -> Arc:
     sin(phi') = sin(phi) (1 - theta^2 K) + cos(phi) n S and cos(phi') (cos(gamma), sin(gamma)) =
     (cos(phi) (1 - n^2 K) - sin(phi) n S, e (sin(phi) S + cos(phi) n K)).
 
-    Where the latitude is not known, axes are not turned: gamma and the derivatives are those of no turn.
+    Where the latitude is not known, axes are not turned: gamma and the derivatives are those without a turn.
 
     Args:
         sin: ``(...)`` sine of the latitude at the start; NaN where it is not known.
@@ -234,7 +235,7 @@ def field_rows(degree: int, terms: int) -> Tensor:
 
     Args:
         degree: highest degree of the coefficients.
-        terms: highest degree J of the monomials. Those of the derivatives end with ``degree - 1``; those of the turns
+        terms: highest degree J of the monomials. Derivatives end with ``degree - 1``; turns
             fall by the factor (distance / radius) / J.
 
     Returns:

@@ -15,7 +15,7 @@ TERMS = 5  # degree of the polynomials for the field there: 1.6 nT of error at 1
 
 
 def radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the radii of curvature [km] along the meridian and across it; that of the sphere where a latitude is NaN.
+    """Return the radii of curvature [km] along the meridian and across it; the sphere's where a latitude is NaN.
 
     Example:
         >>> radii(torch.tensor(float("nan")))[0]

@@ -19,7 +19,7 @@ SHARED = 0.5
 DEAD_BAND = 0.4
 """Deviation of the logarithm of the variance up to which the stated noise is kept; beyond, it is subtracted."""
 LARGEST_SCORE = 8.0
-"""Largest evidence of one element in a reading, that of three standard deviations: a spike counts no more."""
+"""Largest evidence of one element in a reading, three standard deviations: a spike counts no more."""
 LARGEST_RATIO = 64.0
 """Largest ratio of the variances: with the dead band, the standard deviation is scaled by at most 6.5."""
 

@@ -176,7 +176,7 @@ def position_fix(belief: Belief, place: Tensor, std_km: float) -> Innovation:
     entry is missing.
 
     Args:
-        belief: that of a vehicle that knows its place.
+        belief: of a vehicle that knows its place.
         place: ``(..., 2)`` latitude, longitude [deg] of the fix.
         std_km: its root mean square error [km].
     """
@@ -196,7 +196,7 @@ def _leg_covariance(std: Tensor, heading: Tensor) -> Tensor:
 
 
 def _declination(belief: Belief, reading: Reading) -> Tensor:
-    """Return the angle ``(...)`` [rad] from true north to that of the headings: D, where a vehicle steers by a compass
+    """Return the angle ``(...)`` [rad] from true north to the headings' north: D, where a vehicle steers by a compass
     and knows its place; else 0."""
     compass = reading.std.bias[..., 0].isinf() & belief.located
     return torch.where(compass, torch.atan2(belief.field[..., 1], belief.field[..., 0]), 0.0)

@@ -35,9 +35,9 @@ LENGTHS = (0.1, 0.3, 0.6, 1.0)
 SHORTEST = 1 / 40
 """The least length of a leg that is compared, as a share of the displacement."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
-"""Their directions, from that of the displacement [deg]."""
+"""Their directions, from the direction of the displacement [deg]."""
 KEPT = 40
-"""Number of the legs, those of least path and price, of which it is forecast what a reading teaches. On random
+"""Number of the legs, with the least path and price, of which it is forecast what a reading teaches. On random
 planets, all 65 do no better (docs/results/performance.md)."""
 CORRECTION = 0.5
 """Unit of the corrections of a plan: of the logarithm of the length, and of the direction [rad]."""
@@ -68,7 +68,7 @@ def step_price(
     max_steps: int,
     max_move_km: float,
 ) -> Tensor:
-    """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the path run out.
+    """Return the price of a step ``(...)`` [km]: it rises as the steps beyond the path's run out.
 
     The search at the end takes more readings where one is less accurate: as many steps are kept in reserve as readings
     whose mean is accurate to :data:`RESERVE_KM`, at most :data:`RESERVE_SHARE` of the limit. With a price p [km]
@@ -146,7 +146,7 @@ def planned_move(
     moves = _moves(aim, lengths, max_move_km)
     left = aim.unsqueeze(-2) - moves
     shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
-    distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # that of now is the same for all
+    distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # now it is the same for all
     cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
     kept = cost.topk(min(KEPT, cost.shape[-1]), -1, largest=False).indices
     moves, left = (x.gather(-2, kept.unsqueeze(-1).expand(*kept.shape, 2)) for x in (moves, left))

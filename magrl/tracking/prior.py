@@ -29,7 +29,7 @@ ANGLES = 12
 CELLS = 36
 """Number of cells of latitude. Their 5 degrees are less than what a first reading leaves of it (about 10)."""
 HIGHEST = 8
-"""Highest degree that is expected from those of a belief; with 6, half as much more is left out at 1200 km."""
+"""Highest degree that is predicted from the degrees of a belief; with 6, half as much more is left out at 1200 km."""
 LEAST_COS = 0.2
 """Least cosine of the inclination in the downward part of an anomaly, which follows from the error of I."""
 _FOLLOWED = 10  # highest degree of the coefficients whose effect is counted as left out
@@ -76,7 +76,7 @@ class Closure(NamedTuple):
     """What higher degrees do, which a belief does not hold, given the degrees that it holds.
 
     Attributes:
-        extend: ``(K', K)``, the coefficients of degrees 1 to :data:`HIGHEST`, from those of 1 to N.
+        extend: ``(K', K)``, the coefficients of degrees 1 to :data:`HIGHEST`, from degrees 1 to N.
         drift: ``(K, K)`` [nT^2 per unit^2], covariance of the coefficients after a leg by the coefficients of degree
             N + 1 that differ from the expected ones.
         left_out_nt: standard deviation of the field at a distance of a unit by all that differs from the expected
@@ -94,7 +94,7 @@ class Closure(NamedTuple):
 
 @constant
 def closure() -> Closure:
-    """Return the regression of the coefficients of higher degrees on those of a belief, under the spectrum.
+    """Return the regression of the coefficients of higher degrees on a belief's, under the spectrum.
 
     Its covariance has no preferred direction (the dipole's variance is shared over its three coefficients), so the
     regression commutes with turns.
@@ -128,7 +128,7 @@ class Cells(NamedTuple):
 
     Attributes:
         latitude: ``(C,)`` [rad].
-        log_weight: ``(C,)`` logarithm of the probability, plus half of that of the determinant of ``precision``.
+        log_weight: ``(C,)`` logarithm of the probability, plus half the logarithm of the determinant of ``precision``.
         mean: ``(C, K)`` of the coefficients.
         field_covariance: ``(C, 3, 3)`` of the field.
         precision: ``(C, 3, 3)`` inverse of that.
@@ -253,7 +253,7 @@ def lasting_covariances(
 
     The stated drift contains the effect of the iron on the elements, as a mean over the headings. What is left is the
     effect of the anomaly, which has independent parts along magnetic north (that is the error of B_H), across it (B_H
-    times the error of D), and downward (what is left of the error of I), or that of the crust, where that is larger.
+    times the error of D), and downward (what is left of the error of I), or of the crust, where that is larger.
 
     Args:
         field: ``(..., 3)`` north, east, down [nT].
@@ -267,7 +267,7 @@ def lasting_covariances(
     """
     bias, drift, iron = (torch.as_tensor(std).to(field.device, torch.float64).square() for std in errors[1:])
     field = field.double()
-    bias = torch.where(bias < math.inf, bias, 0.0)  # that of D, which is then no reading
+    bias = torch.where(bias < math.inf, bias, 0.0)  # D is then no reading
     level = iron[..., :2].mean(-1)
     axes = torch.stack((level, level, iron[..., 2]), -1)
     spread = (elements_jacobian(field).square() @ axes.unsqueeze(-1)).squeeze(-1)

@@ -34,7 +34,7 @@ class Rules(CheckedModel):
         arrival: what ends the episode: the objective or the distance, with a signal at each step, or a declaration by
             the vehicle.
         radius_km: distance from the destination that counts as arrived, but by the objective [km].
-        confidence: least probability of a correct declaration; below it, episodes end without one.
+        confidence: minimum probability of a correct declaration; below it, episodes end without one.
         range_km: prior standard deviation of the displacement to the destination along each axis [km].
         step_price: price of a step [% of SPL]: a higher one gives fewer steps and a longer path.
         caution: weight of the uncertainty in the plan.
@@ -92,7 +92,7 @@ class Rules(CheckedModel):
 
     @property
     def signaled(self) -> bool:
-        """Whether the vehicle is told of its arrival, so that the destination is not where it has been."""
+        """Whether the vehicle gets an arrival signal, so that the destination is not where it has been."""
         return self.arrival != "declared"
 
 
@@ -108,7 +108,7 @@ class Reading(NamedTuple):
         step: ``(...)`` number of the step, 0 at the start.
         known: ``(..., 3)`` elements at the start, where they are known; they count at the first reading.
         known_std: ``(..., 3)`` their standard deviations.
-        price: ``(...)`` price of a step [% of SPL] of each vehicle; None for that of the rules.
+        price: ``(...)`` price of a step [% of SPL] of each vehicle; None for the rules' price.
         place: ``(..., 2)`` latitude, longitude [deg] of the start, where it is known; it counts at the first reading.
         target_place: ``(..., 2)`` the same of the destination.
         leg_std: ``(..., 2)`` standard deviations of the leg, along and across it, beside the drift of the rules [km].
@@ -133,7 +133,7 @@ class State(NamedTuple):
     ``(..., H, S)``, ``(..., H, S, S)``, their place ``(..., 2)`` and the logarithms of their weights ``(..., H)``;
     their noise estimates ``(..., H, 3)`` twice; displacements to visited places ``(..., 24, 2)`` [km]; weights of the
     objective ``(..., 3)``; the path flown ``(...)`` and the displacement from the start ``(..., 2)`` [km]; and the
-    angle of north ``(...)``, from that of the belief to that of the headings [rad]: D, where a compass and a place are
+    angle of north ``(...)``, from the belief's north to the headings' north [rad]: D, where a compass and a place are
     known."""
 
     mean: Tensor

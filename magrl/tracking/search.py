@@ -135,7 +135,7 @@ def arrival_ellipse(gradient: Tensor, covariance: Tensor, weights: Tensor, radiu
     Args:
         gradient: ``(..., E, 2)`` expected gradient of each element, northward and eastward [per km].
         covariance: ``(..., E, 2, 2)`` its covariance.
-        weights: ``(..., E)`` those of :func:`arrival_weights`.
+        weights: ``(..., E)`` from :func:`arrival_weights`.
         radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
 
     Raises:

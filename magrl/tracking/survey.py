@@ -42,7 +42,7 @@ def surveyed(
         elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] as measured; NaN for an element that is missing.
         std: ``(3,)`` their standard deviations.
         place: ``(..., 2)`` latitude, longitude [deg] of the destination.
-        model: that of the belief.
+        model: of the belief.
         crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
     """

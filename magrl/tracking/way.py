@@ -118,8 +118,9 @@ class DestinationPosterior(NamedTuple):
         return (self.weights * (self.points.norm(dim=-1) <= radius_km)).sum(-1) * self.reached
 
     def radius(self, probability: float) -> Tensor:
-        """Return the least radius ``(...)`` [km] around the vehicle that holds the place with a probability; that of
-        half of the Earth where the points do not reach so far.
+        """Return the least radius ``(...)`` [km] around the vehicle that holds the place with a probability.
+
+        Where the points do not reach so far, it is half of the Earth's circumference.
 
         Example:
             >>> points = torch.tensor([[0.0, 30.0], [0.0, 10.0]])

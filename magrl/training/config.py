@@ -73,7 +73,7 @@ class RunConfig(CheckedModel):
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
     wandb_entity: str = ""
-    """User or team of wandb; that of the login by default."""
+    """User or team of wandb; by default from the login."""
     wandb_group: str = ""
     """Group of runs in wandb; the name of the run without its seed by default."""
     wandb_tags: tuple[str, ...] = ()
@@ -224,14 +224,14 @@ Config = TypeVar("Config")
 def parse_config(
     kind: type[Config], presets: Mapping[str, Config], recipe: str, description: str | None, args: Sequence[str] | None
 ) -> Config:
-    """Return the settings of a command line: the preset, then what overrides it; or those of a run to resume.
+    """Return the settings of a command line: the preset, then what overrides it; or the settings of a run to resume.
 
     Args:
         kind: class of the settings.
-        presets: settings by name; the default is that of the name of ``--task``, or else the first.
+        presets: settings by name; the default has the name of ``--task``, or else is the first.
         recipe: file name of the recipe.
         description: text of ``--help``.
-        args: command line; that of this process by default.
+        args: command line; by default of this process.
 
     Raises:
         UsageError: for a run that cannot be resumed, or options beside ``--resume``.
@@ -259,13 +259,13 @@ def parse_config(
 def parse(
     kind: Callable[..., Config], recipe: str, description: str | None, args: Sequence[str] | None = None, **options: Any
 ) -> Config:
-    """Return the settings of a command line, in tyro's form or in that of W&B sweeps.
+    """Return the settings of a command line, in tyro's form or in the form of W&B sweeps.
 
     Args:
         kind: class of the settings.
         recipe: file name of the recipe.
         description: text of ``--help``.
-        args: command line; that of this process by default.
+        args: command line; by default of this process.
         options: options of ``tyro.cli``.
 
     Example:

@@ -146,12 +146,12 @@ class WandbRun(CurveLog):
     wandb needs no login and looks up no host.
 
     Args:
-        folder: run folder; its name is that of the run in wandb.
+        folder: run folder; its name is the run's name in wandb.
         mode: ``offline`` (no network, no login), ``online`` or ``disabled``.
         config: settings shown with the run.
         group: runs that belong together.
         tags: labels to filter runs by.
-        entity: user or team; that of the login by default.
+        entity: user or team; by default from the login.
         run_id: id of the run; an existing run is resumed.
 
     Example:

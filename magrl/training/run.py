@@ -79,7 +79,7 @@ def make_collector(env: EnvBase, policy: TensorDictModuleBase, **options: Any) -
     """Return a collector whose batches are used before the next one is made.
 
     Args:
-        env: environment; its device is that of the batches.
+        env: environment; its device holds the batches.
         policy: policy with its exploration.
         **options: options of TorchRL's ``Collector``, such as ``frames_per_batch`` and ``total_frames``.
 

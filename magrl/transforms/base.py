@@ -141,7 +141,7 @@ class ObservationTransform(Transform):
         return observation_spec
 
     def _check_shape(self, name: NestedKey, key: NestedKey, shape: torch.Size) -> None:
-        """Raise unless the last dimensions of a value that is read are those of :attr:`in_sizes`."""
+        """Raise unless the last dimensions of a value that is read agree with :attr:`in_sizes`."""
         size = self.in_sizes.get(name, ())
         if size and shape[-len(size) :] != size:
             hint = f": UnsqueezeTransform(-1, [{key!r}], [...]) of torchrl adds the dimension" * (size == (1,))

@@ -63,7 +63,7 @@ class ProgressReward(StepReward):
 
     The first term is ``gamma * phi(after) - phi(before)`` with ``gamma`` 1 and the potential ``phi`` of minus the
     distance, which leaves the optimal policy without discount unchanged: a detour and the return add up to 0. An
-    episode of up to 90 steps earns less than any arrival at the same destination if it ends without one. In place of
+    episode of up to 90 steps earns less than any arrival at the same destination if it ends without one. It replaces
     the reward of the environment. Privileged.
 
     Args:
@@ -142,7 +142,7 @@ class HighestSPL(StatefulTransform):
 class SPLReward(StepReward):
     """Write the change of :class:`HighestSPL` minus the price of a step: the return of an episode is its SPL.
 
-    It is 10 times SPL minus 1, minus a tenth of the prices of its steps. In place of the reward of
+    It is 10 times SPL minus 1, minus a tenth of the prices of its steps. It replaces the reward of
     the environment. Privileged.
 
     Args:

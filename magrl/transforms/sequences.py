@@ -22,7 +22,7 @@ _LEAST_NT = 1000.0  # of the horizontal intensity; below, small angles no longer
 _FARTHEST = 6.0  # a feature; beyond, it is as at this value
 _FIELD_NT, _FIELD_RANGE_NT = (25_000.0, 45_000.0), (12_000.0, 15_000.0)  # of B_H and of the total intensity
 _FAR_NT = 1500.0  # unit of the difference to the target
-_NOISE_NT = 5.0  # unit of the accuracy, that of good sensors
+_NOISE_NT = 5.0  # unit of the accuracy, as of good sensors
 
 
 READING_SIZE = 26

@@ -38,7 +38,7 @@ KNOWN_KEYS = (*STD_KEYS, *PLACE_KEYS, "step_price")
 
 
 def reading_of(seen: TensorDictBase) -> Reading:
-    """Return the reading of a TensorDict: :data:`READ_KEYS`, and those of :data:`KNOWN_KEYS` that it has.
+    """Return the reading of a TensorDict: :data:`READ_KEYS`, and the keys of :data:`KNOWN_KEYS` that it has.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -195,9 +195,9 @@ class DeclareArrival(ObservationTransform):
     (:func:`magrl.tracking.declaring`).
 
     Args:
-        rules: those of the track.
-        optional: those of the track.
-        in_keys: those of the track.
+        rules: of the track.
+        optional: of the track.
+        in_keys: of the track.
 
     Raises:
         ValueError: for an environment whose action has no third number.

@@ -129,7 +129,7 @@ class ObservationView(_View):
     """Keys that an agent observes, and their scaling; see :meth:`magrl.envs.GeomagneticNavEnv.observation_view`.
 
     Args:
-        observe_heading: whether cosine and sine of the heading are observed. Without them the state is that of Eq. 3-1,
+        observe_heading: whether cosine and sine of the heading are observed. Without them the state is Eq. 3-1,
             from which a policy without memory cannot tell the direction of its next leg.
         observe_difference: whether target elements minus measured elements are observed.
         observe_areas: whether no-go areas in sight are observed (:class:`~magrl.transforms.NoGoAreas`).
@@ -230,7 +230,7 @@ class ReadingView(_View):
     """Describe a plain observation: keys of the readings in physical units, for networks that scale by themselves.
 
     Args:
-        keys: observed keys, in the order of their numbers: among those of :data:`READING_SIZES`.
+        keys: observed keys, in the order of their numbers: among :data:`READING_SIZES`.
         max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 

@@ -4,8 +4,8 @@
 
 The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 200 vehicles starts the same episodes. Oracles are
 the true bearing, which knows where vehicle and destination are, and the shortest paths around no-go areas, all or those
-seen so far. The rule around the areas in sight reads public keys alone. The episodes of *Readings* are those of
-*Anywhere*: only what a policy observes is different.
+seen so far. The rule around the areas in sight reads public keys alone. *Readings* has the episodes of *Anywhere*:
+only what a policy observes is different.
 """
 
 from __future__ import annotations

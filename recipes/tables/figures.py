@@ -199,8 +199,7 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
 
     Args:
         figures: Names of figures.
-        tasks: Number of tasks of new flights; by default 64 for place-error, 200 for conditions, 10 000 for globe, and
-            2000 for reliability.
+        tasks: Number of tasks of new flights; by default 64 to 10 000, by figure.
         out: Folder of the folders figures and results; files of the same name are replaced.
 
     Raises:

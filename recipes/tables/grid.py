@@ -134,9 +134,9 @@ def make(
 
     Args:
         tables: Names of tables in tables.toml; all by default.
-        navigators: Navigators, as in recipes/evaluate.py; those of tables.toml by default.
-        tasks: Number of tasks; that of tables.toml by default.
-        confidence: Minimum probability at which vehicles declare their arrival; that of tables.toml by default.
+        navigators: Navigators, as in recipes/evaluate.py; by default from tables.toml.
+        tasks: Number of tasks; by default from tables.toml.
+        confidence: Minimum probability at which vehicles declare their arrival; by default from tables.toml.
         jobs: Processes that fly, with one thread each; of tables of the kind flights.
         device: Device of the flights: cpu, cuda, cuda:0, ...
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.

@@ -125,7 +125,7 @@ def make(
     Args:
         log: Log with positions and altitudes.
         noise: White noise that is added to D [deg], I [deg], B_H [nT].
-        date: Date of IGRF; by default that of the log.
+        date: Date of IGRF; by default from the log.
         out: Folder of measured.md.
     """
     survey, std, table = read_survey(log, date), torch.tensor(noise).double(), []

@@ -3,8 +3,8 @@
     python recipes/tables/publish.py README.md docs/reproduction.md
 
 A document marks the place and the file of a table by `<!-- table: docs/results/NAME.md -->` and `<!-- end -->`. Names
-of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator | SPL % -->`, leave out the others.
-`| navigator = secant or Kalman |` also leaves out the rows whose cell in that column is another one.
+of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator | SPL % -->`, leave out the others. With
+conditions, as in `| navigator = secant or Kalman |`, rows with another cell in that column are left out.
 """
 
 from __future__ import annotations

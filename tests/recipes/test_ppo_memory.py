@@ -96,7 +96,7 @@ def test_a_training_writes_its_agent(tmp_path) -> None:
 
 
 def test_errors_are_those_of_the_task() -> None:
-    with pytest.raises(ValueError, match=r"noise and drift are those of the task, got \(0\.1, 0\.0, 0\.0\)"):
+    with pytest.raises(ValueError, match=r"noise and drift are the task's, got \(0\.1, 0\.0, 0\.0\)"):
         recipe.Config(noise=(0.1, 0.0, 0.0))
 
 

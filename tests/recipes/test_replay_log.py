@@ -122,7 +122,7 @@ def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) ->
 @pytest.mark.parametrize(
     ("change", "arguments", "message"),
     [
-        (("B_H", "H"), (), "is 'B_H': name that of B_H, one of \\['time', 'D', 'I', 'H'"),
+        (("B_H", "H"), (), "is 'B_H': name the column of B_H, one of \\['time', 'D', 'I', 'H'"),
         (("1.310", "x"), (), r"cannot read .*: row 2, D: 'x' is not a number"),
         (("1.310", ""), (), r"cannot read .*: row 2, D: '' is not a number"),
         (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),

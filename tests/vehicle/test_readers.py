@@ -52,7 +52,7 @@ def test_px4(tmp_path: Path) -> None:
     check(log)
     assert "the file is damaged or truncated" not in log.notes
     assert log.source == "PX4 ULog: vehicle_magnetometer, vehicle_attitude, vehicle_gps_position"
-    assert [note for note in log.notes if "D is that of the model" in note]
+    assert [note for note in log.notes if "D is the model's" in note]
     notes = read_log(written(path, ulog({"sensor_mag": 1.0}))).notes
     assert any("without the calibration of the autopilot" in note for note in notes)
 
@@ -90,7 +90,7 @@ def test_ardupilot(tmp_path: Path) -> None:
     log = read_log(path)
     check(log)
     assert log.north == "model"
-    assert "D is that of the model" in log.notes[0]
+    assert "D is the model's" in log.notes[0]
     assert len(read_log(written(path, dataflash()[:-400])).samples) < 12
 
 

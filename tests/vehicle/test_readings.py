@@ -189,7 +189,7 @@ RADIANS = np.pi / 180
         (lambda t: t.assign(heading=t["heading"] + 70), ["the course .* is -70 deg to the right.*check the compass"]),
         (
             lambda t: t.assign(D=t["D"] - 30, heading=t["heading"] - 30, D_std=OUTAGE_STD),
-            ["D is -45 deg from the heading, that of IGRF -16: the compass is about -30 deg off; check its axes"],
+            ["D is -45 deg from the heading, IGRF's -16: the compass is about -30 deg off; check its axes"],
         ),
         (
             lambda t: t.assign(D=25.0, heading=t["heading"] - t["D"] + 25, D_std=OUTAGE_STD),

@@ -54,7 +54,7 @@ class EpisodeNumbers(StatefulTransform):
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        seed: seed of the numbers, beside that of the environment.
+        seed: seed of the numbers, beside the environment's seed.
 
     Raises:
         ValueError: for a seed that is not a whole number.
@@ -75,9 +75,9 @@ class EpisodeNumbers(StatefulTransform):
     size: int
     """Numbers of an episode."""
     entries: Mapping[str, int] | None = None
-    """Numbers of each entry of a record by its name, in place of ``size``."""
+    """Numbers of each entry of a record by its name, instead of ``size``."""
     numbers_dtype: ClassVar[torch.dtype | None] = None
-    """Type of these numbers; by default that of the first value."""
+    """Type of these numbers; by default the first value's."""
     draws = 0
     """Random numbers that an episode takes before its first reading."""
     step_draws = 0
@@ -100,7 +100,7 @@ class EpisodeNumbers(StatefulTransform):
         raise NotImplementedError
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor | TensorDict:
-        """Write what the numbers change in the values at ``in_keys``; return those of the next step."""
+        """Write what the numbers change in the values at ``in_keys``; return the numbers of the next step."""
         raise NotImplementedError
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
@@ -172,7 +172,7 @@ def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:
     """Return the keys of all errors that a policy may not read: what is true, the errors, and their streams.
 
     Args:
-        kind: base class of the errors; those of a module that is not imported are left out.
+        kind: base class of the errors; a module that is not imported is left out.
 
     Example:
         >>> from magrl.transforms import NorthReferenceError
@@ -186,9 +186,9 @@ def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:
 class ReadingErrors(EpisodeErrors):
     """Base class of errors of a reading, which keep its true value and state its accuracy.
 
-    The accuracy is that of :meth:`accuracy` at :data:`TYPICAL_FIELD`. Variances add up over the errors of a chain, and
+    The accuracy is :meth:`accuracy` at :data:`TYPICAL_FIELD`. Variances add up over the errors of a chain, and
     the first error of a chain keeps the true value. A reading of three elements is D, I, B_H. Where an error carries I
-    beyond the vertical, the reading is that of a magnetometer: I is 180 degrees minus I, and D is reversed.
+    beyond the vertical, the reading is as of a magnetometer: I is 180 degrees minus I, and D is reversed.
 
     It writes the true value at ``true_field``, privileged, and its accuracy at :data:`magrl.sensor_std.STD_KEYS`.
 
@@ -196,7 +196,7 @@ class ReadingErrors(EpisodeErrors):
         in_keys: of the transform.
         out_keys: of the transform.
         seed: seed of the errors.
-        stated: accuracy that the vehicle is told, in place of that of the errors:
+        stated: accuracy that the vehicle knows; by default the accuracy of the errors:
             :data:`magrl.sensor_std.PERFECT` for errors that no data sheet states.
 
     :meth:`_disturb` returns the numbers of the next step, so that a drift keeps its value. :meth:`accuracy` knows no

@@ -161,7 +161,7 @@ def _compass(seed: int) -> MagneticNorth:  # noqa: ARG001
 def load_conditions(path: Path | str) -> Conditions:
     """Read conditions from a TOML or JSON file, whose keys are the arguments of :class:`Conditions`.
 
-    The name is that of the file by default; the options of :class:`~magrl.transforms.VectorErrors` are those of
+    The name is the file's by default; the options of :class:`~magrl.transforms.VectorErrors` are in
     ``sensors.vector``.
 
     Raises:

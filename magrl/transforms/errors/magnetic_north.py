@@ -19,7 +19,7 @@ from magrl.transforms.errors.base import Episode, ReadingErrors
 class MagneticNorth(ReadingErrors):
     """Measure headings from magnetic north: the vehicle has a magnetometer and an accelerometer, and no true north.
 
-    D is the direction of magnetic north from the vehicle's own north, so it reads 0 everywhere, and that of the
+    D is the direction of magnetic north from the vehicle's own north, so it reads 0 everywhere, and D of the
     destination is 0, too. That it tells nothing is stated by a ``bias_std`` of infinity. A leg starts along the
     vehicle's heading from magnetic north and keeps its course on the ground; at its end, the vehicle turns to the same
     heading from magnetic north there. So headings tell nothing of how D changes along the path. (On the Earth up to 60
@@ -31,7 +31,7 @@ class MagneticNorth(ReadingErrors):
     environment for its step.
 
     Args:
-        in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, and those of the destination.
+        in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, and the destination's.
 
     Raises:
         ValueError: for another number of keys.

@@ -66,7 +66,7 @@ class NorthReferenceError(ReadingErrors):
         fixed: whether ``constant_deg`` is the constant part itself, in every episode; it may then be negative.
         in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, the last leg, whose first number
             is the distance [km], and optionally the position ``(..., 2)``, latitude and longitude [deg]: b then grows
-            with the secant of the latitude, as that of every gyrocompass does.
+            with the secant of the latitude, as with every gyrocompass.
         out_keys: the heading and the elements that the vehicle reads, in place by default.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
             episode are constant part, drift and b itself [deg].

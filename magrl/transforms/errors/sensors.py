@@ -1,4 +1,4 @@
-"""Errors of sensors: noise, bias, scale, drift, outages, rounding, and those of a vector magnetometer."""
+"""Errors of sensors: noise, bias, scale, drift, outages, rounding, and the errors of a vector magnetometer."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class SensorErrors(ReadingErrors):
     Gauss-Markov process along the path. Sizes are standard deviations of normal errors (cut at four of them), E numbers
     in the unit of each element; those that are not given are 0.
 
-    ``sensor_std`` becomes that of the errors which are new at each reading (noise and rounding), during an outage
-    :data:`~magrl.sensor_std.OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots of sums
-    of variances, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    ``sensor_std`` is of errors that are new at each reading (noise and rounding), during an outage
+    :data:`~magrl.sensor_std.OUTAGE_STD`; ``bias_std`` is of constant and slow errors. Both are roots of sums of
+    variances, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     Args:
         noise: white noise.
@@ -180,7 +180,7 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
 
     In 15 % of cases there is no noise. Otherwise a common factor spans two decades up to 0.2 deg, 0.2 deg and 20 nT,
     half of them above 0.04 deg. Each element has a factor of its own, log-uniform from 0.4 to 2.5,
-    and in 30 % of cases that of D is multiplied by a number from 1 to 7, as where the north reference is poor.
+    and in 30 % of cases the factor of D is multiplied by a number from 1 to 7, as where the north reference is poor.
 
     In half of the cases there is a bias as well, log-uniform over 1.6 decades up to 0.35 deg, 0.05 deg and
     45 nT, with the same factors of their own.
@@ -191,7 +191,7 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
             the cases above 0.02 deg; the larger, the more noise.
 
     Returns:
-        ``(..., 6)``: those of the noise, and those of the bias.
+        ``(..., 6)``: of the noise, and of the bias.
 
     Raises:
         ValueError: for another number of uniform numbers, or an exponent that is not above 0.

@@ -100,7 +100,7 @@ class MagneticWeather(ReadingErrors):
             self._starts()
 
     def _longest_h(self) -> float:
-        """Return the longest time of an episode [h]; by default that of the longest legs until the step limit."""
+        """Return the longest time of an episode [h]; by default for the longest legs until the step limit."""
         if self.span_h is not None:
             return self.span_h
         steps, move_km = (getattr(self.parent, name, None) for name in ("max_steps", "max_move_km"))
@@ -121,7 +121,7 @@ class MagneticWeather(ReadingErrors):
     def _constants(self, stream: Tensor) -> Tensor:
         """Return the minute at which an episode starts, and 0 minutes since then, ``(..., 2)``.
 
-        The minutes of the surrogates come after those of the record.
+        The minutes of the surrogates come after the record's.
         """
         starts, length = self._starts().to(stream.device), len(self.record.variation)
         if len(self.variation) > length and self._trains():

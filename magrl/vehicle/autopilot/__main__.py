@@ -4,8 +4,8 @@
     python -m magrl.vehicle.autopilot /dev/ttyUSB0,57600 --target 0 75.4 13240 --north magnetic --noise 0 0.1 20
     python -m magrl.vehicle.autopilot udp:10110 --nmea --target 61.5 1.2 --date 2026-06-30 --noise 0.1 0.05 20
 
-The vehicle must move, and its operator chooses the mode in which it takes headings (docs/onboard.md). The messages are
-written to the folder of the flight; the same command continues a flight that was interrupted.
+The vehicle must move, and its operator chooses the mode in which it takes headings (docs/onboard.md).
+Messages are written to the folder of the flight; the same command continues an interrupted flight.
 """
 
 from __future__ import annotations
@@ -47,11 +47,16 @@ def parser() -> argparse.ArgumentParser:
     add("--navigator", default="anywhere", help="anywhere, kalman, memory, secant, or a policy file; default anywhere")
     add("--north", choices=("true", "magnetic"), default="true", help="north of the vehicle; default true")
     add("--noise", type=float, nargs=3, required=True, help="standard deviations of readings [deg deg nT]")
-    add("--bias", type=float, nargs=3, help="those of constant errors [deg deg nT]; default those of --calibration")
+    add(
+        "--bias",
+        type=float,
+        nargs=3,
+        help="the same of constant errors [deg deg nT]; default from --calibration",
+    )
     add("--calibration", type=Path, help="file of a calibration, of python -m magrl.vehicle.logs --calibrate")
     add("--read-s", type=float, default=30.0, help="duration of a reading [s]; default 30")
     add("--radius-km", type=float, default=25.0, help="radius of the destination [km]; default 25")
-    add("--confidence", type=float, default=0.8, help="least probability of arrival to stop; default 0.8")
+    add("--confidence", type=float, default=0.8, help="minimum probability of arrival to stop; default 0.8")
     add("--nmea", action="store_true", help="the link is NMEA 0183; default MAVLink")
     add("--level", action="store_true", help="NMEA: the magnetometer is level, without XDR of PTCH and ROLL")
     add("--speed", help="NMEA: water or ground; default water")
@@ -69,7 +74,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _main(options: argparse.Namespace) -> None:
     if options.altitude and not options.date:
-        raise ValueError("--altitude is for the model of the Earth, which needs --date, that of the flight")
+        raise ValueError("--altitude is for the model of the Earth, which needs --date, the date of the flight")
     calibration = Calibration.load(options.calibration) if options.calibration else None
     options.bias = options.bias or (calibration.std if calibration else (0.0, 0.0, 0.0))
     loop, connection = Loop(vehicle(options), read_s=options.read_s, calibration=calibration), link(options)

@@ -129,10 +129,10 @@ class Loop:
     seconds, without spikes, and reports the mean of the field at the mean of its places: one step a leg. A field that
     does not change in any digit, that is missing or that the vehicle rejects is reported as missing, and the vehicle
     continues by dead reckoning. While speed or heading is not heard, or the computer was suspended, the last one is
-    taken, and the stated error of the leg grows. Messages may come late, twice or out of order. The time is that of the
-    vehicle's clock; where that was set, time goes on from the last message.
+    taken, and the stated error of the leg grows. Messages may come late, twice or out of order. The time is from the
+    vehicle's clock; where the clock was set, time goes on from the last message.
 
-    The heading is from true north, or, where that of the vehicle is magnetic, of any reference that turns slowly: the
+    The heading is from true north, or, where the vehicle's heading is magnetic, of any reference that turns slowly: the
     loop measures its angle from magnetic north at each reading.
 
     Args:
@@ -166,8 +166,8 @@ class Loop:
         self.note = ""
         """What the last reading lacked, as text; empty if nothing."""
         self._latest: dict[str, tuple[float, float]] = {}  # times and values of the quantities
-        self._place, self._origin, self._path = (0.0, 0.0), (0.0, 0.0), 0.0  # [km]; the origin is that of a reading
-        self._offset = 0.0  # of the autopilot's north from that of the vehicle [deg]
+        self._place, self._origin, self._path = (0.0, 0.0), (0.0, 0.0), 0.0  # [km]; the origin is a reading's
+        self._offset = 0.0  # of the autopilot's north from the vehicle's [deg]
         self._since = -math.inf  # time of the last command, or the start of the reading
         self._unsure, self._fastest = [0.0, 0.0], 0.0  # of the leg, along and across [km]; of the flight [m/s]
         self._samples: list[tuple[float, ...]] | None = []
@@ -210,7 +210,7 @@ class Loop:
         return self._sample(sampled="x" in new)
 
     def _on_time(self, time: float) -> float:
-        """Return the time of a message: that of the vehicle's clock, or that of the last message where it was set."""
+        """Return the time of a message: from the vehicle's clock, or the last message's where the clock was set."""
         if self.now == -math.inf:
             self.now = time
         ahead = time + self._shift - self.now
@@ -303,7 +303,7 @@ class Loop:
         return None if self.command is None else self.vehicle.step(None, None, None, heading, distance, **unsure)
 
     def _mean(self, rows: np.ndarray) -> tuple[Sequence[float | None], float, float, str]:
-        """Return the reading, the heading, the angle of the autopilot's north from that of the vehicle, and a text that
+        """Return the reading, the heading, the angle of the autopilot's north from the vehicle's, and a text that
         says what is missing."""
         offset = self._offset
         nothing = (None, None, None), self._value("heading") - offset, offset

@@ -15,12 +15,12 @@ from magrl.vehicle.onboard import Command
 RATE_HZ = 10.0
 """Rate of the messages that are asked for."""
 CENTRIPETAL_M_S2 = 3.6
-"""Largest centripetal acceleration of a turn, that of a bank of 20 degrees [m/s²]."""
+"""Largest centripetal acceleration of a turn, with a bank of 20 degrees [m/s²]."""
 SENSORS: Mapping[str, float] = {"HIGHRES_IMU": FIELD_NT["gauss"]} | dict.fromkeys(
     ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3"), FIELD_NT["milligauss"]
 )
-"""Messages with a magnetometer, and their unit [nT]. Those of integers have steps of 100 nT."""
-_WAIT = 30  # coarser messages, before one of them is taken in place of HIGHRES_IMU
+"""Messages with a magnetometer, and their unit [nT]. Messages of integers have steps of 100 nT."""
+_WAIT = 30  # coarser messages, before one of them is taken instead of HIGHRES_IMU
 _CLOCKS_S = 60.0  # a message whose clock differs by more has another one
 _VELOCITY_AND_YAW = 0b100111000111  # type_mask: position, acceleration and yaw rate are ignored
 _VELOCITY = 0b110111000111  # a Rover of ArduPilot takes a velocity with a yaw to the south for one backward
@@ -34,7 +34,7 @@ _DIALECT = "pymavlink.dialects.v20.ardupilotmega"
 
 
 class Messages:
-    """Turn messages of MAVLink into measurements on one clock, that of the attitude.
+    """Turn messages of MAVLink into measurements on one clock, the attitude's.
 
     Args:
         speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD.
@@ -69,13 +69,13 @@ class Messages:
         return Measurement(time, *axes)
 
     def _time(self, message: Any) -> float:
-        """Return the time of a message, or that of the last attitude where it has none, or that of another clock."""
+        """Return the time of a message, or of the last attitude where it has none, or has another clock."""
         now = self._now or 0.0
         own = getattr(message, "time_usec", 1e3 * getattr(message, "time_boot_ms", 1e3 * now)) / 1e6
         return own if message.get_type() == "ATTITUDE" or abs(own - now) <= _CLOCKS_S else now
 
     def _chosen(self, name: str, number: int) -> bool:
-        """Return whether a message is that of the magnetometer; the first one that may be is chosen."""
+        """Return whether a message is the magnetometer's; the first one that may be is chosen."""
         self._wait -= 1
         if self._sensor is None and (name == "HIGHRES_IMU" or self._wait < 0):
             self._sensor = name, number

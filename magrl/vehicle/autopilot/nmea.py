@@ -88,8 +88,8 @@ class NmeaLink:
     Args:
         address: ``"udp:10110"``, the port at which sentences arrive and to the sender of the last one that counts the
             answers go; or a serial port and its rate, such as ``"/dev/ttyUSB0,38400"``.
-        north: that of :class:`Sentences`.
-        options: those of :class:`Sentences`.
+        north: as of :class:`Sentences`.
+        options: of :class:`Sentences`.
 
     Raises:
         ImportError: without pynmeagps, or without pyserial for a serial port.

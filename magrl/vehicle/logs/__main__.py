@@ -4,9 +4,8 @@
     python -m magrl.vehicle.logs way.csv --calibration quay.json --every-km 20          # writes way_readings.csv
     python recipes/replay_log.py way_readings.csv                                       # what would be commanded
 
-Logs are CSV files (columns such as time_s, mag_x_nT, mag_y_uT, roll_deg, heading_true_deg, speed_kn, lat, lon) and
-those of autopilots and ships (docs/logs.md). The axes are forward, right, down, the angles roll,
-pitch, heading.
+Logs are CSV files, or recorded by autopilots and ships (docs/logs.md).
+Axes are forward, right, down; angles are roll, pitch, heading.
 """
 
 from __future__ import annotations
@@ -41,13 +40,13 @@ def parser() -> argparse.ArgumentParser:
     add = arguments.add_argument
     add("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
     add("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a calibrated one in use")
-    add("--north", choices=NORTHS, help="north of the heading; default that of the log")
-    add("--every-km", type=float, default=20.0, help="least length of a leg [km]; default 20")
+    add("--north", choices=NORTHS, help="north of the heading; default from the log")
+    add("--every-km", type=float, default=20.0, help="minimum length of a leg [km]; default 20")
     add("--calibration", type=Path, help="file of a calibration, which corrects the axes")
     add("--calibrate", type=Path, help="calibration to write (.json), of the swing in this log")
     add("--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H")
     add("--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5")
-    add("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
+    add("--date", help="date for IGRF, such as 2026-06-30; default from the log")
     add("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
     return arguments
 
@@ -89,7 +88,7 @@ def remarks(log: Log, options: argparse.Namespace) -> list[str]:
 
 
 def _north(log: Log, options: argparse.Namespace) -> str | None:
-    """Return the north of the heading; that of a log without a heading is magnetic."""
+    """Return the north of the heading; without a heading it is magnetic."""
     return (options.north or log.north) if "heading" in log.samples else "magnetic"
 
 

@@ -22,7 +22,7 @@ from magrl.vehicle.logs.conventions import UNITS, attitude_of, column_of, from_e
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Recording
 
 MODEL_NORTH = (
-    "the heading is that of a compass plus the declination of a model, so D is that of the model and is not used "
+    "the heading is a compass plus the declination of a model, so D is the model's and is not used "
     "(state the north as true if the heading had another source, such as two GNSS antennas)"
 )
 NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
@@ -204,7 +204,7 @@ def _with_one_speed(tables: _Tables) -> _Tables:
 
 
 def _tables(rows: _Rows) -> _Tables:
-    """Return rows of each sensor as an array, in the order of their times, and sensors in that of their names."""
+    """Return rows of each sensor as an array, in the order of their times, and sensors in the order of their names."""
     return {columns: {name: np.array(sorted(some[name])) for name in sorted(some)} for columns, some in rows.items()}
 
 
@@ -216,8 +216,8 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
 
     A bag of ROS 2 is its folder, a file in it, or a single file (.mcap, .db3) without the folder's metadata.yaml.
 
-    Times are those of the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
-    become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
+    Times are from the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
+    become FRD and NED. The bag does not state the north of the heading, which is the Imu's.
     """
     highlevel, store = package("rosbags.highlevel", "rosbags"), package("rosbags.typesys", "rosbags")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
@@ -273,7 +273,7 @@ _SENTENCES: Mapping[str, Sequence[tuple[str, str, float]]] = {
 """Columns of each sentence: names, their fields, and units, of which the last one goes first."""
 _TRANSDUCER = ("tdrtype", "dataunit", "tdrid", "data")
 _TILT = re.compile(r"(?i)(ROLL)(?![a-z])|PI?TCH(?![a-z])")
-"""Names of transducers that are roll, or else pitch, also with that of a device: ``PTCH-BOX``."""
+"""Names of transducers that are roll, or else pitch, also with the name of a device: ``PTCH-BOX``."""
 _CHOICES = {"heading": ("heading_true", "heading_magnetic"), "speed": ("speed_water", "speed_ground")}
 INVALID = {"status": ("V",), "mi": ("V", "S", "M"), "posMode": ("N", "S", "M"), "quality": (0, 7, 8)}
 """Fields of a sentence whose values are not valid, or simulated, or entered by hand."""

@@ -118,7 +118,7 @@ def calibrate(
     are fitted by an ellipsoid, which does not show a misalignment of the axes. The fit is least squares without
     outliers. Its prior is :data:`GAIN_STD`, :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg``, which
     remain where the swing shows nothing. The standard deviations allow for errors that last a hundredth of the swing,
-    hold for a field such as that of the swing and tilts of :data:`TILT_DEG`, and include those of the known elements.
+    hold for a field such as of the swing and tilts of :data:`TILT_DEG`, and include the errors of the known elements.
 
     Args:
         axes_nt: ``(N, 3)`` forward, right, down [nT].

@@ -23,7 +23,7 @@ from magrl.field.elements import FIELD_NT, field_vector, measured_elements
 Array = NDArray[np.float64]
 
 NORTHS = ("true", "magnetic", "model")
-"""North of a heading: that of a gyrocompass, of a compass, or of a compass that adds the declination of a model."""
+"""North of a heading: of a gyrocompass, of a compass, or of a compass that adds the declination of a model."""
 EARTH_NT = 48000.0
 """Total intensity of the Earth's field, within 45 %."""
 SYMBOLS = {"nt": "nanotesla", "mg": "milligauss", "ut": "microtesla", "μt": "microtesla", "g": "gauss"}
@@ -126,7 +126,7 @@ def check_intensity(total: float, expected: float = EARTH_NT) -> None:
 
     Args:
         total: median total intensity of a log, in an unknown unit.
-        expected: total intensity at its place [nT], by default that of the Earth.
+        expected: total intensity at its place [nT], by default the Earth's.
 
     Raises:
         ValueError: with the unit that it probably has, also where a format states tesla.
@@ -154,7 +154,7 @@ def check_intensity(total: float, expected: float = EARTH_NT) -> None:
 
 
 def rotation(attitude_deg: Tensor) -> Tensor:
-    """Return the rotation from the vehicle's axes to those of the world.
+    """Return the rotation from the vehicle's axes to the world's.
 
     Args:
         attitude_deg: ``(..., 3)`` roll, pitch, heading [deg].
@@ -174,7 +174,7 @@ def rotation(attitude_deg: Tensor) -> Tensor:
 
 
 def attitude_of(quaternion: Tensor) -> Tensor:
-    """Return roll, pitch, heading [deg] ``(..., 3)`` of a rotation from the vehicle's axes to those of the world.
+    """Return roll, pitch, heading [deg] ``(..., 3)`` of a rotation from the vehicle's axes to the world's.
 
     Args:
         quaternion: ``(..., 4)`` w, x, y, z, of any length.
@@ -209,7 +209,7 @@ def from_enu(attitude_deg: Tensor) -> Tensor:
 def elements_of_axes(axes_nt: Tensor, attitude_deg: Tensor) -> Tensor:
     """Return D [deg], I [deg], B_H [nT] ``(..., 3)`` of three axes and an attitude.
 
-    D is from the north of the heading: it is that of the field if this is true north.
+    D is from the north of the heading: it is the field's if this is true north.
 
     Args:
         axes_nt: ``(..., 3)`` the field forward, right, down [nT].

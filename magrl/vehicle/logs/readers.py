@@ -21,7 +21,7 @@ def read_log(*paths: Path | str, sensor: str | None = None) -> Log:
 
     Args:
         paths: files, recognized by their content: CSV, PX4 (ULog), ArduPilot (DataFlash), MAVLink (telemetry), ROS,
-            NMEA 0183; or a folder of ROS 2. Columns of later ones replace those of earlier ones; all have one clock.
+            NMEA 0183; or a folder of ROS 2. Columns of later ones replace columns of earlier ones; all have one clock.
         sensor: magnetometer of those that a log of PX4, ArduPilot or ROS has; by default one that is calibrated, works
             and was used.
 

@@ -45,9 +45,9 @@ def readings_of(
     positions where it has neither.
 
     Args:
-        log: samples. Without a heading, it is that of a compass: the horizontal field, leveled by roll and pitch.
-        every_km: least length of a leg.
-        north: north of the heading, one of :data:`~magrl.vehicle.logs.conventions.NORTHS`; default that of the log.
+        log: samples. Without a heading, it is as of a compass: the horizontal field, leveled by roll and pitch.
+        every_km: minimum length of a leg.
+        north: north of the heading, one of :data:`~magrl.vehicle.logs.conventions.NORTHS`; default from the log.
         calibration: correction of the axes.
 
     Returns:
@@ -102,7 +102,7 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     Args:
         path: the file.
         names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
-            ``longitude``, and ``altitude``, which the file may lack. A unit that ends a name counts, such as that of
+            ``longitude``, and ``altitude``, which the file may lack. A unit that ends a name counts, such as of
             ``H_uT``, and a name is also found with one, such as ``altitude_m``; without one, it is nT, deg or km.
         time: its column of the time, numbers or ISO 8601, which it may lack.
 
@@ -149,7 +149,7 @@ def _columns(raw: DataFrame, names: Mapping[str, str]) -> dict[str, Array]:
             columns[key] = (unit_of(name, kind) or 1.0) * numbers(raw[name].fillna(""))
             check_range(key, columns[key])
         elif key in ("D", "I", "B_H", "heading", "distance") or (located and key != "altitude"):
-            raise ValueError(f"no column is {name!r}: name that of {key}, one of {short([*raw], 300)}")
+            raise ValueError(f"no column is {name!r}: name the column of {key}, one of {short([*raw], 300)}")
     return columns
 
 
@@ -158,10 +158,10 @@ def joined(table: DataFrame, every_km: float) -> DataFrame:
 
     Args:
         table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
-        every_km: least length of a leg; 0 for the rows as they are.
+        every_km: minimum length of a leg; 0 for the rows as they are.
 
     Returns:
-        The same columns; the others are those of the middle row of each leg.
+        The same columns; the others are of the middle row of each leg.
 
     Raises:
         ValueError: for legs so long that one reading is left.
@@ -271,7 +271,7 @@ _PLACE = "latitude", "longitude", "altitude"
 
 
 def difference_from_igrf(readings: DataFrame, date: str) -> Tensor:
-    """Return D [deg], I [deg], B_H [nT] of readings minus those of IGRF at their positions, ``(N, 3)``.
+    """Return D [deg], I [deg], B_H [nT] of readings minus IGRF at their positions, ``(N, 3)``.
 
     Args:
         readings: columns D, I, B_H, latitude, longitude, and optionally altitude [km].
@@ -350,12 +350,12 @@ def _field_mistakes(readings: DataFrame, expected: Tensor) -> list[str]:
 
 
 def _compass_mistakes(declination: Tensor, expected: Tensor) -> list[str]:
-    """Return how far a compass is off: it has D 0, or that of a model which was added to it."""
+    """Return how far a compass is off: it has D 0, or the D of a model which was added to it."""
     off = torch.stack((declination, declination - expected)).add(180).remainder(360).sub(180)
     least = off[off.abs().median(1).values.argmin()].median().item()
     if abs(least) <= LEAST_TURN_DEG:
         return []
-    shown = f"D is {declination.median():.0f} deg from the heading, that of IGRF {expected.median():.0f}"
+    shown = f"D is {declination.median():.0f} deg from the heading, IGRF's {expected.median():.0f}"
     return [f"{shown}: the compass is about {least:.0f} deg off; check its axes and its calibration"]
 
 

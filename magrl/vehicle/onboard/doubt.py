@@ -16,7 +16,7 @@ _LAST, _LEAST = 8, 2
 
 
 class Doubt(NamedTuple):
-    """The last surprises, the tail probability of the first reading, where the start is known, those of the last ones,
+    """The last surprises, the tail probability of the first reading, where the start is known, of the last ones,
     and the least fit so far: a doubt stays until a fix of the position.
 
     Example:

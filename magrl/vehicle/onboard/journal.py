@@ -57,7 +57,7 @@ def _accuracy(value: Any) -> SensorStd:
     sensor_std = SensorStd.of(SensorStd(*map(_plain, value)) if whole else value)
     for name, std in sensor_std._asdict().items():
         if max(std[1:] if name == "bias" and sensor_std.magnetic else std) > OUTAGE_STD:
-            raise ValueError(f"sensor_std.{name} must be at most {OUTAGE_STD:g}, that of an outage, got {max(std):g}")
+            raise ValueError(f"sensor_std.{name} must be at most {OUTAGE_STD:g}, as in an outage, got {max(std):g}")
         if 0 < std[2] < LEAST_STD_NT:
             raise ValueError(
                 f"sensor_std.{name}: {std[2]:g} nT of B_H is less than the {LEAST_STD_NT:g} nT of the best sensors in "
@@ -73,7 +73,7 @@ class Options(Inputs, Rules):
         arrival: always declared: nothing tells a vehicle that it has arrived.
         model: given to :meth:`~magrl.vehicle.onboard.Onboard.start`, as are ``start_km`` and ``target_km``.
         north: ``"true"``: headings are from true north, and D is measured; or ``"magnetic"``: they are from magnetic
-            north, those of a compass, and D is not measured.
+            north, as of a compass, and D is not measured.
         sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
             D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show. The drift is what
             a known start does not show, and what readings average in part.

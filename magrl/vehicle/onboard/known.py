@@ -23,7 +23,7 @@ from magrl.vehicle.onboard.limits import check_earth_reading
 MODEL_STD = (0.26, 0.20, 133.0)
 """Standard deviations of D [deg], I [deg], B_H [nT] of a model of the core, which omits crust and currents.
 
-To that of D, ``MODEL_D_NT / B_H`` degrees are added in squares. Source: the error model of the World Magnetic Model
+To D, ``MODEL_D_NT / B_H`` degrees are added in squares. Source: the error model of the World Magnetic Model
 2025 (technical report, NOAA NCEI and British Geological Survey, 2024).
 """
 MODEL_D_NT = 5417.0
@@ -32,7 +32,7 @@ MOST_SIGMAS = 5.0
 SLACK_NT = 100.0
 """Deviation of the field vector that always fits; chosen [nT]."""
 LEAST_TAIL = 0.01
-"""Tail probability below which a first reading does not fit the start. Most of it is that of large anomalies, which are
+"""Tail probability below which a first reading does not fit the start. Most of it is of large anomalies, which are
 rare: of 144 right starts, none was below it, nor of 144 in the field of a crust."""
 IRON_NT = 2000.0
 """Standard deviation of the iron of a vehicle along each of its axes, before a calibration; chosen [nT]."""
@@ -95,7 +95,7 @@ class Knowledge(NamedTuple):
         target: elements of the destination.
         elements: elements at the start, and their standard deviations ``std``; None where they are not known.
         rules: values of :class:`~magrl.tracking.Rules`: the model of the Earth, and the errors of the places.
-        place: latitude and longitude of the start [deg], and ``target_place`` those of the destination; None where a
+        place: latitude and longitude of the start [deg], and ``target_place`` of the destination; None where a
             vehicle does not use them.
     """
 

@@ -1,6 +1,6 @@
 """Limits of the Earth's field, of a vehicle and of its sensors, for checks of plain numbers.
 
-The limits of the field are those of IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity
+The limits of the field are from IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity
 of 21 900 to 69 400 nT, a horizontal intensity up to 41 900 nT, and a change of the vector of up to 16 nT/km between
 75° S and 75° N and 63 nT/km up to 88°, where north turns along the path; B_H and B_Z alone change by up to 16.4 nT/km
 anywhere. Where the inclination is within 1.6 degrees, the horizontal intensity is at least 24 100 nT and the gradient
@@ -20,13 +20,13 @@ from magrl.field.elements import FIELD_NT, NAMES, UNITS
 from magrl.tracking.planning import MISSING_KM, SLOPES
 
 TOTAL_NT = (20000.0, 76000.0)
-"""Least and greatest total intensity: 10 % beyond those of IGRF [nT]."""
+"""Least and greatest total intensity: 10 % beyond IGRF [nT]."""
 MOST_HORIZONTAL_NT = 44000.0
-"""Greatest horizontal intensity: 2000 nT beyond that of IGRF [nT]."""
+"""Greatest horizontal intensity: 2000 nT beyond IGRF [nT]."""
 EQUATOR_NT = 22000.0
-"""Least horizontal intensity where the inclination is within pi/2 degrees: 10 % below that of IGRF [nT]."""
+"""Least horizontal intensity where the inclination is within pi/2 degrees: 10 % below IGRF [nT]."""
 EQUATOR_SLOPE_DEG = 0.5
-"""Least gradient of the inclination where it is within pi/2 degrees: a third of that of IGRF [deg per 100 km]."""
+"""Least gradient of the inclination where it is within pi/2 degrees: a third of IGRF's [deg per 100 km]."""
 SLOPE_NT_KM = 60.0
 """Greatest change of the field vector along a path, up to 88 degrees of latitude [nT/km]."""
 MERIDIAN_SLOPE_NT_KM = 16.4
@@ -225,7 +225,7 @@ def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Inc
 
 
 def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
-    """Return which readings are those of a stuck sensor, as text; empty if none is.
+    """Return which readings are from a stuck sensor, as text; empty if none is.
 
     Args:
         unchanged: from :func:`unchanged_km`; 0 for an element that is not measured.

@@ -1,7 +1,7 @@
 """Navigation on board one vehicle: plain numbers in, a command out, without an environment.
 
 Angles are in degrees, clockwise from the vehicle's north, true or magnetic, distances in kilometers, and intensities in
-nanotesla. The step is that of :mod:`magrl.tracking.pilot`.
+nanotesla. The step is :mod:`magrl.tracking.pilot`.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class Onboard:
         navigator: ``"anywhere"`` for the pretrained agent, ``"kalman"``, or a file of
             :func:`~magrl.tracking.save_pilot`, which run without TorchRL; ``"secant"``, a file of
             :func:`magrl.save_policy`, a policy or a navigator, of which the vehicle gets a copy.
-        options: those of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are those of the
-            training, but :data:`USUAL`. The limits of a leg are at most those of the training.
+        options: of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are from the
+            training, but :data:`USUAL`. The limits of a leg are at most the training's limits.
 
     Raises:
         ValueError: for an option out of its range, an unknown navigator, or one that reads more than the vehicle knows.
@@ -176,7 +176,7 @@ class Onboard:
             horizontal_intensity: B_H there [nT].
             heading: heading of the leg [deg], -360 to 360; in the first step the heading at the start.
             distance: length of the leg [km]; 0 in the first step.
-            distance_std: standard deviation of that length [km], beside the drift of the options, such as that of an
+            distance_std: standard deviation of that length [km], beside the drift of the options, such as for an
                 inertial navigation system.
             heading_std: the same of the heading of the leg [deg].
 
@@ -327,7 +327,7 @@ class Onboard:
         return None, ""
 
     def _lost(self, track: Track) -> str:
-        """Return why readings or legs cannot be those of a vehicle, as text; empty if they can."""
+        """Return why readings or legs cannot be from a vehicle, as text; empty if they can."""
         useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
         unchanged = [km * use for km, use in zip(self._unchanged, useful, strict=True)]
