@@ -47,12 +47,7 @@ def parser() -> argparse.ArgumentParser:
     add("--navigator", default="anywhere", help="anywhere, kalman, memory, secant, or a policy file; default anywhere")
     add("--north", choices=("true", "magnetic"), default="true", help="north of the vehicle; default true")
     add("--noise", type=float, nargs=3, required=True, help="standard deviations of readings [deg deg nT]")
-    add(
-        "--bias",
-        type=float,
-        nargs=3,
-        help="the same of constant errors [deg deg nT]; default from --calibration",
-    )
+    add("--bias", type=float, nargs=3, help="the same of constant errors [deg deg nT]; default from --calibration")
     add("--calibration", type=Path, help="file of a calibration, of python -m magrl.vehicle.logs --calibrate")
     add("--read-s", type=float, default=30.0, help="duration of a reading [s]; default 30")
     add("--radius-km", type=float, default=25.0, help="radius of the destination [km]; default 25")
