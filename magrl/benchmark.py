@@ -66,9 +66,9 @@ class Track:
     north: str = "true"
     """North of the vehicles, ``"true"`` or ``"magnetic"``."""
     crust: bool = False
-    """Whether the field is WMMHR, with crust, versus IGRF-14."""
+    """Whether the field is WMMHR, with crust, or IGRF-14."""
     box: bool = False
-    """Whether the tasks are in the paper's box, ``test-1000``, versus random regions."""
+    """Whether the tasks are in the paper's box, ``test-1000``, or in random regions."""
     date: str = "2025-01-01"
     """Date of IGRF-14 outside the paper's box."""
     seed: int = 0

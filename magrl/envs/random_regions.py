@@ -54,7 +54,7 @@ def earth_scenario(
         seed: random seed; the result is a pure function of the arguments.
         date: date of the field, as in :class:`Scenario`.
         generation: generation of IGRF, 13 or 14.
-        crust: whether the field is :class:`~magrl.field.WMMHR` (degree 133, 2025 to 2030) versus IGRF.
+        crust: whether the field is :class:`~magrl.field.WMMHR` (degree 133, 2025 to 2030) instead of IGRF.
         **options: of :func:`region_scenario`.
 
     Raises:
