@@ -17,6 +17,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+import torch
 from support.recipes import load
 from torchrl.data import Composite
 
@@ -26,7 +27,7 @@ from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.transforms import CONDITIONS
 
-publish = load("tables/publish")
+flights, publish = load("tables/flights"), load("tables/publish")
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
@@ -254,14 +255,27 @@ def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
 
 def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> None:
     scores, page = (ROOT / "docs/results/scores.md").read_text(encoding="utf-8"), TEXTS[ROOT / "README.md"]
-    for name, (_, spl, earned, trained) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
+    for name, (*_, spl, earned, trained) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
         task = name.split("-")[0].lower() or "box"
-        agent = "shortest path around the areas (oracle)" if task == "nogo" else "kalman"
-        assert re.search(rf"^\| {task} \| {re.escape(agent)} \|.*\| {spl} \|$", scores, re.MULTILINE), name
+        agent = "secant, least turn around the areas in sight" if task == "nogo" else "kalman"
+        assert re.search(rf"^\| {task} \| {re.escape(agent)} \|.*\| {earned} \|.*\| {spl} \|$", scores, re.MULTILINE), (
+            name
+        )
         threshold = gymnasium.spec(f"magrl/GeomagneticNavigation{name}").reward_threshold
         assert task == "nogo" or float(earned) == threshold, name
         runs = re.findall(rf"^\| {task} \| (\S+) \| \d.*\| ([\d.]+)(?: \(\S+\))? \|$", scores, re.MULTILINE)
         assert trained == " ".join(max(runs, key=lambda run: float(run[1])))
+
+
+def test_vehicles_of_the_readme_have_the_intervals_of_their_episodes() -> None:
+    episodes, page = read_episodes(ROOT / "docs/results/known.csv.gz"), TEXTS[ROOT / "README.md"]
+    for navigator, cells in rows("## Results", "navigator (given)", page).items():
+        for level, cell in zip(("ship", "underwater", "low-cost"), cells, strict=True):
+            some = episodes[(episodes["navigator"] == navigator) & (episodes["level"] == level)]
+            right, wrong = (100 * torch.tensor(some[name].to_numpy()).double() for name in ("success", "false_arrival"))
+            region = torch.tensor(some["region"].to_numpy())
+            shares = ("{:.1f} ± {:.1f}".format(*flights.clustered(values, region)) for values in (right, wrong))
+            assert cell == " / ".join(shares), (navigator, level)
 
 
 def test_presets_and_their_speeds() -> None:
