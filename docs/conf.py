@@ -2,13 +2,19 @@
 
 import re
 import sys
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
+from docutils import nodes  # noqa: E402
+from sphinx.pycode import ModuleAnalyzer  # noqa: E402
+from sphinx.util.nodes import make_refnode  # noqa: E402
+
 import magrl  # noqa: E402 - this tree, not an installed version
+from magrl.envs.specs import KEYS  # noqa: E402
 
 project, author, version = "magrl", "The magrl developers", magrl.__version__
 project_copyright = author
@@ -46,6 +52,30 @@ def add_title(app: Any, name: str, content: list[str]) -> None:  # noqa: ARG001
         content[0] = f"---\norphan: true\n---\n\n# {name.removeprefix('results/')}\n\n{content[0]}"
 
 
+def describe(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:  # noqa: ARG001
+    """Describe an imported constant as where it is defined; keep initials of authors from becoming lists."""
+    lines[:] = [re.sub(r"^(\s*)([A-Z]\. )", r"\1\\\2", line) for line in lines]
+    for module in [module for module in sys.modules if what == "data" and module.startswith("magrl.")]:
+        lines[:] = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", name.rpartition(".")[2]), lines)
+
+
+def link_names(app: Any, doctree: nodes.document, page: str) -> None:
+    """Link names of the API in inline code, with their package or without it, to their entries."""
+    entries, short = app.env.domains.python_domain.objects, defaultdict(list)
+    for full, entry in entries.items():
+        name = full.rpartition(".")[2]
+        word = name.islower() and ("_" not in name or name in KEYS) and name not in magrl.__all__  # such as `move`
+        if entry.objtype in {"class", "function", "data", "exception"} and not entry.aliased and not word:
+            short[name].append(entry)
+    for code in list(doctree.findall(nodes.literal)):
+        text = code.astext().partition("(")[0]
+        found = [entries[text]] if text in entries else short.get(text.removeprefix("magrl."), [])
+        if len(found) == 1 and not isinstance(code.parent, nodes.reference | nodes.title):
+            code.replace_self(make_refnode(app.builder, page, found[0].docname, found[0].node_id, code.deepcopy()))
+
+
 def setup(app: Any) -> None:
     """Connect the hooks of this project."""
     app.connect("source-read", add_title)
+    app.connect("autodoc-process-docstring", describe, priority=600)  # after napoleon
+    app.connect("doctree-resolved", link_names)

@@ -74,6 +74,21 @@ def test_links_and_names_lead_somewhere(page: Path) -> None:
         assert hasattr(importlib.import_module(module), attribute) or importlib.util.find_spec(name), name
 
 
+def test_the_api_has_the_names_that_pages_and_examples_import() -> None:
+    scripts = [path.read_text(encoding="utf-8") for path in ROOT.glob("docs/examples/*.py")]
+    nodes = chain(*(ast.walk(ast.parse(code)) for code in [*scripts, *(code for _, code in EXAMPLES)]))
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and str(node.module).startswith("magrl.")]
+    page = TEXTS[ROOT / "docs/reference.md"]
+    shown = set(re.findall(r"^\.\. auto\w+:: \S+\.(\w+)", page, re.MULTILINE))
+    for name, members in re.findall(r"^\.\. automodule:: (\S+)\n   :members: *(.*)", page, re.MULTILINE):
+        module = importlib.import_module(name)
+        own = re.findall(r"^(?:def |class )?(\w+)", inspect.getsource(module), re.MULTILINE)
+        imported = [key for key, value in vars(module).items() if callable(value)]  # of a package, without its data
+        shown |= set(members.split(", ") if members else imported if hasattr(module, "__path__") else own)
+    internal = {"CheckedModel", "Count", "NonNegative", "Positive", "Rising", "Seed", "Share"}  # of settings
+    assert {name.name for node in imports for name in node.names} - shown == internal
+
+
 def test_every_page_is_in_the_index() -> None:
     index = TEXTS[ROOT / "docs" / "index.md"].splitlines()
     for page in {*ROOT.glob("docs/*.md"), NOTEBOOK} - {ROOT / "docs" / "index.md"}:

@@ -10,10 +10,6 @@ from types import ModuleType
 
 import pytest
 import torch
-from tensordict import TensorDictBase
-from torchrl.envs import Compose, StepCounter, TransformedEnv
-
-from magrl.geodesy import wrap_angle
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.append(str(ROOT / "docs" / "examples"))
@@ -21,53 +17,6 @@ sys.path.append(str(ROOT / "docs" / "examples"))
 
 def example(name: str) -> ModuleType:
     return importlib.import_module(name)
-
-
-plume, plume_env = example("plume"), example("plume_env")
-
-
-# The estuary
-
-
-def guided_plume(num_envs: int = 4) -> TransformedEnv:
-    return plume.make_env(num_envs, 30, seed=0, guided=True)
-
-
-def test_the_way_by_two_tracers_leads_to_the_target() -> None:
-    """An oracle that holds the theoretical heading arrives: so the transforms speak the language of this env too."""
-    env = TransformedEnv(plume_env.PlumeEnv(200), Compose(StepCounter(30), *plume.guidance()))
-
-    def hold(td: TensorDictBase) -> TensorDictBase:
-        turn = wrap_angle(td["way"] - td["heading"]).clamp(-math.pi / 2, math.pi / 2)
-        return td.set("action", torch.cat((torch.full_like(turn, 0.6), turn), -1))
-
-    flown = env.rollout(30, hold, break_when_any_done=False, break_when_all_done=True)
-    assert flown["next", "terminated"].any(1).double().mean() > 0.97
-    assert flown["way_valid"].double().mean() > 0.95
-
-
-def test_the_plume_reward_is_that_of_the_env_and_of_the_alignment() -> None:
-    env, plain = guided_plume(), plume.make_env(4, 30, seed=0, guided=False)
-    start, plain_start = env.reset(), plain.reset()
-    action = torch.rand(4, 2) * 2 - 1
-    after, plain_after = (e.step(td.set("action", action))["next"] for e, td in ((env, start), (plain, plain_start)))
-    assert start["way_valid"].all()
-    apart = wrap_angle(after["heading"] - start["way"]).abs()
-    torch.testing.assert_close(after["reward"], plain_after["reward"] - 0.2 * apart)
-
-
-def test_the_plume_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = {"seeds": 2, "total_frames": 128, "num_envs": 16, "init_random_frames": 32, "batch_size": 16}
-    trainings = plume.main(plume.Config(out=tmp_path, eval_every=4, eval_tasks=16, max_steps=5, **small))
-    assert {name: [run.frames for run in runs] for name, runs in trainings.items()} == {
-        "gg_td3": [[64, 128]] * 2,
-        "td3": [[64, 128]] * 2,
-    }
-    assert "| TD3 | 2 | 2 of 2 never |" in capsys.readouterr().out
-    assert (tmp_path / "plume.png").read_bytes().startswith(b"\x89PNG")
-
-
-# Pendulum and classic control
 
 
 def test_the_pendulum_example() -> None:
