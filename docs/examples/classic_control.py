@@ -35,7 +35,7 @@ class Config:
 
 
 def closed_bounds(spec: Bounded, open_bound: float) -> tuple[Tensor, Tensor]:
-    """Return the bounds of a spec, with `open_bound` in place of infinity."""
+    """Return the bounds of a spec, with `open_bound` where it is infinite."""
     return spec.space.low.nan_to_num(neginf=-open_bound), spec.space.high.nan_to_num(posinf=open_bound)
 
 

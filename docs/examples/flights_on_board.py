@@ -2,7 +2,7 @@
 
     python docs/examples/flights_on_board.py --flights 100 --seed 2026
 
-The field is that of ppigrf, positions move on geographiclib's geodesics, readings have white noise of .05 degrees and
+The field is from ppigrf, positions follow geographiclib's geodesics, readings have white noise of .05 degrees and
 5 nT, and the vehicle measures no D. Starts are between 60 degrees south and north, destinations at 300 to 500 km.
 """
 

@@ -64,7 +64,7 @@ def elements_of(field: np.ndarray) -> tuple[float, float, float]:
 
 
 class Cessna:
-    """The aircraft: it moves by steps, and speaks MAVLink.
+    """The aircraft: it advances in steps, and speaks MAVLink.
 
     Args:
         place: latitude and longitude [deg].
@@ -110,7 +110,7 @@ class Cessna:
         self._model["ap/heading_setpoint"] = heading_deg
 
     def messages(self) -> Iterator[Any]:
-        """Move by a step, and yield the messages of its end."""
+        """Advance by a step, and yield the messages at its end."""
         until = self.time + STEP_S - 1e-6
         while self.time < until:
             self._model.run()

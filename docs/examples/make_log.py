@@ -15,7 +15,7 @@ from magrl.geodesy import move
 import torch
 
 COURSES = [290.0] * 4 + [335.0] * 4 + [310.0] * 6 + [280.0] * 4 + [315.0] * 6
-"""Headings of the moves [deg]."""
+"""Headings of the legs [deg]."""
 LEG_KM, SPEED_KM_H = 20.0, 24.0
 NOISE = (0.02, 0.02, 2.0)
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""

@@ -19,7 +19,7 @@ import pandas
 import torch
 
 COURSES = [290.0] * 3 + [335.0] * 3 + [310.0] * 4 + [280.0] * 5
-"""Headings of the hours of the way [deg]."""
+"""Headings of the hours of the passage [deg]."""
 SPEED_KM_H, CURRENT_KM_H = 20.0, (0.9, -0.6)
 """Speed through the water, and the current northward and eastward."""
 PLACE, START = (62.47, 6.15), pandas.Timestamp("2026-06-30T06:00:00Z")
@@ -42,7 +42,7 @@ def logged(time: np.ndarray, heading: np.ndarray, tilt: float, place: np.ndarray
 
 
 def write(folder: Path) -> None:
-    """Write both logs: a swing of ten minutes at 5 Hz at the quay, and a way of 15 hours at 1 Hz."""
+    """Write both logs: a swing of ten minutes at 5 Hz at the quay, and a passage of 15 hours at 1 Hz."""
     folder.mkdir(parents=True, exist_ok=True)
     time = np.arange(3000) / 5
     logged(time, 720 * time / 600, 8.0, np.tile(PLACE, (3000, 1)), seed=0).to_csv(folder / "swing.csv", index=False)

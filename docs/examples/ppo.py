@@ -58,7 +58,7 @@ class Config(RunConfig):
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode."""
     distance_cost: NonNegative = 0.1
-    """Cost of a move [1/km]."""
+    """Cost of a leg [1/km]."""
     alignment_weight: float = 3.0
     """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
     alignment_offset: float = math.pi / 4
@@ -111,7 +111,7 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
 
 
 def make_stochastic_actor(actor: TensorDictSequential, env: TransformedEnv, config: Config) -> ProbabilisticActor:
-    """Return the actor of the training: a normal distribution whose mean is that of ``actor``, through a tanh.
+    """Return the actor of the training: a normal distribution around the mean of ``actor``, through a tanh.
 
     Its mean shares the weights of the deterministic ``actor``, which is evaluated and saved; its standard deviation is
     a parameter.

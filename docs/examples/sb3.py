@@ -48,7 +48,7 @@ class Config:
 
 
 def make_model(config: Config) -> BaseAlgorithm:
-    """Return an agent, whose networks and discount are those of the recipes' preset `fast` for SAC and TD3."""
+    """Return an agent, with the networks and discount of the recipes' preset `fast` for SAC and TD3."""
     envs = VecMonitor(BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=config.num_envs, autoreset_mode="SameStep")))
     settings: dict[str, Any] = {"learning_rate": config.learning_rate, "seed": config.seed, "device": "cpu"}
     if config.algorithm == "ppo":
