@@ -25,6 +25,7 @@ import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
+from magrl.envs.navigation import NAMED_ENVS
 from magrl.transforms import CONDITIONS
 
 flights, publish = load("tables/flights"), load("tables/publish")
@@ -291,6 +292,15 @@ def test_vehicles_of_the_readme_have_the_intervals_of_their_episodes() -> None:
             region = torch.tensor(some["region"].to_numpy())
             shares = ("{:.1f} ± {:.1f}".format(*flights.clustered(values, region)) for values in (right, wrong))
             assert cell == " / ".join(shares), (navigator, level)
+
+
+@pytest.mark.parametrize(("task", "first"), [("Box", 0), ("Anywhere", 0), ("Readings", 0), ("NoGo", 13)])
+def test_observations_of_the_named_tasks_are_listed_by_index(task: str, first: int, monkeypatch) -> None:
+    monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
+    listed = rows(f"## {task}\n", "index", TEXTS[ROOT / "docs/tasks.md"])
+    ends = [[int(end) for end in part.split("–")] for row in listed for part in row.split(", ")]
+    size = NAMED_ENVS[task.lower()](seed=0).observation_spec["observation"].shape[-1]
+    assert list(chain(*(range(part[0], part[-1] + 1) for part in ends))) == list(range(first, size))
 
 
 def test_presets_and_their_speeds() -> None:
