@@ -59,12 +59,16 @@ def describe(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
         lines[:] = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", name.rpartition(".")[2]), lines)
 
 
+WORDS = {*KEYS, "step_price"}
+"""Keys and options with the name of a function, which are not linked to it."""
+
+
 def link_names(app: Any, doctree: nodes.document, page: str) -> None:
     """Link names of the API in inline code, with their package or without it, to their entries."""
     entries, short = app.env.domains.python_domain.objects, defaultdict(list)
     for full, entry in entries.items():
         name = full.rpartition(".")[2]
-        word = name.islower() and ("_" not in name or name in KEYS) and name not in magrl.__all__  # such as `move`
+        word = name.islower() and ("_" not in name or name in WORDS) and name not in magrl.__all__
         if entry.objtype in {"class", "function", "data", "exception"} and not entry.aliased and not word:
             short[name].append(entry)
     for code in list(doctree.findall(nodes.literal)):
