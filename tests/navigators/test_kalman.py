@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 import magrl
-from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate, summarize
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.files import load_tensors, save_tensors
@@ -22,19 +22,13 @@ from magrl.tracking import Rules, correction_network
 from magrl.tracking.network import pretrained
 from magrl.transforms import SensorErrors
 
-STD, BIAS = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)
-
 
 @pytest.fixture
 def env() -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=5, seed=3, start_heading="random")
 
 
-def tasks(count: int) -> Scenario:
-    return first_tasks(choose_tasks(None, "paper-100"), count)
-
-
-@pytest.mark.parametrize("make", [Kalman, Anywhere, lambda: Declaring(Secant())], ids=["kalman", "anywhere", "secant"])
+@pytest.mark.parametrize("make", [Anywhere, lambda: Declaring(Secant())], ids=["anywhere", "secant"])
 def test_a_second_call_on_a_state_changes_nothing(env, make) -> None:
     """Also where episodes start at different steps, and after a batch of another size."""
 
@@ -54,25 +48,23 @@ def test_a_second_call_on_a_state_changes_nothing(env, make) -> None:
         assert torch.equal(second, once)
 
 
-@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), BIAS])
-def test_an_untrained_correction_is_the_move_of_kalman(bias: tuple[float, ...]) -> None:
-    base = GeomagneticNavEnv(num_envs=40, seed=0, start_heading="random")
-    env = TransformedEnv(base, SensorErrors(STD, bias=bias, seed=0))
+def test_an_untrained_correction_is_the_move_of_kalman() -> None:
+    base = GeomagneticNavEnv(num_envs=10, seed=0, start_heading="random")
+    env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0), bias=(0.1, 0.1, 10.0), seed=0))
     agents = Kalman(step_price=2.0), Anywhere(source=correction_network((8,)), step_price=2.0)
-    plain, corrected = (env.set_seed(0) and env.rollout(5, agent, auto_reset=True)["action"] for agent in agents)
+    plain, corrected = (env.set_seed(0) and env.rollout(4, agent, auto_reset=True)["action"] for agent in agents)
     torch.testing.assert_close(corrected, plain)
 
 
 @pytest.mark.parametrize("name", ["kalman", "anywhere", "secant"])
 def test_every_navigator_declares(name: str) -> None:
-    summary = summarize(evaluate(name, tasks(40), arrival="declared"))
-    assert summary["success_rate"] >= 97
-    assert summary["success_rate"] + summary["false_arrival_rate"] == 100
+    summary = summarize(evaluate(name, first_tasks(choose_tasks(None, "paper-100"), 10), arrival="declared"))
+    assert summary["success_rate"] == 100
     assert summary["spl"] > 80
 
 
 def test_moves_stay_within_adapted_limits() -> None:
-    env = GeomagneticNavEnv(num_envs=50, seed=0, start_heading="random")
+    env = GeomagneticNavEnv(num_envs=20, seed=0, start_heading="random")
     action = env.rollout(2, Anywhere().adapted(max_move_km=10.0, max_turn_rad=0.5))["action"]
     assert 5 < action[..., 0].max() <= 10 + 1e-4
     assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4
@@ -80,7 +72,7 @@ def test_moves_stay_within_adapted_limits() -> None:
 
 def test_actions_are_alike_by_any_default_type_of_floating_point_numbers() -> None:
     def actions() -> Tensor:
-        return GeomagneticNavEnv(num_envs=3, seed=0).rollout(5, Anywhere())["action"]
+        return GeomagneticNavEnv(num_envs=2, seed=0).rollout(3, Anywhere())["action"]
 
     expected = actions()
     torch.set_default_dtype(torch.float64)
@@ -108,10 +100,7 @@ def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"format": [1] * 10**5},
-            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 4: train it again",
-        ),
+        ({"format": [1] * 10**5}, r"format \[1, 1, .{70}\.\.\.; this version reads format 4: train it again"),
         ({"rules": {"max_steps": 0}}, "max_steps"),
         ({"rules": {"speed": 3}}, "speed"),
         ({"num_cells": [10**9]}, "num_cells must be"),

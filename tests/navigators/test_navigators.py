@@ -1,11 +1,13 @@
 """Navigators that need no training."""
 
 import copy
+import itertools
 import math
 from collections.abc import Callable
 
 import pytest
 import torch
+from support.tracks import randn
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
@@ -13,7 +15,7 @@ from magrl.envs import GeomagneticNavEnv, Region, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
-from magrl.geodesy import geodesic, steer
+from magrl.geodesy import geodesic
 from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant
 from magrl.navigators.base import displacement_to
 from magrl.navigators.quasi_newton import probe_length
@@ -22,20 +24,15 @@ from magrl.transforms import Conditions, SensorErrors, with_conditions
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(tasks=task_set(100, seed=71)), num_envs=100, seed=0)
+    return GeomagneticNavEnv(Scenario(tasks=task_set(30, seed=71)), num_envs=30, seed=0)
 
 
 NOISE = (0.05, 0.05, 5.0)
-EVERY = sorted(NAVIGATORS)
-
-
-def flight(env: GeomagneticNavEnv, navigator) -> TensorDict:
-    env.set_seed(0)  # back to each vehicle's first task
-    return evaluation_rollout(env, navigator)
 
 
 def flown(env: GeomagneticNavEnv, navigator) -> dict[str, float]:
-    return summarize(episode_measures(flight(env, navigator)))
+    env.set_seed(0)  # back to each vehicle's first task
+    return summarize(episode_measures(evaluation_rollout(env, navigator)))
 
 
 def noisy(navigator, noise: tuple[float, float, float]) -> Callable:
@@ -50,30 +47,26 @@ def noisy(navigator, noise: tuple[float, float, float]) -> Callable:
     return act
 
 
-@pytest.mark.parametrize(("noise", "spl"), [((0.0, 0.0, 0.0), 99.5), (NOISE, 95.0)])
-def test_kalman_arrives_without_a_map(noise: tuple[float, ...], spl: float) -> None:
+def test_kalman_arrives_without_a_map() -> None:
     """From any heading, by the standard deviations that come with the readings."""
-    scenario = Scenario(tasks=task_set(30, seed=93))
-    base = GeomagneticNavEnv(scenario, num_envs=30, seed=0, start_heading="random")
-    summary = flown(TransformedEnv(base, SensorErrors(noise)), Kalman())
+    base = GeomagneticNavEnv(Scenario(tasks=task_set(10, seed=93)), num_envs=10, seed=0, start_heading="random")
+    summary = flown(TransformedEnv(base, SensorErrors(NOISE)), Kalman())
     assert summary["success_rate"] == 100
-    assert summary["spl"] > spl
+    assert summary["spl"] > 95
 
 
-@pytest.mark.parametrize("name", ["secant", "mean_jacobian"])
-def test_a_navigator_that_is_told_of_its_arrival_searches(name: str) -> None:
+def test_a_navigator_that_is_told_of_its_arrival_searches() -> None:
     """Under constant errors the destination is not where the readings fit."""
     biased, rates = Conditions("biased", sensors={"bias": (0.15, 0.05, 20.0)}), []
     for search in (False, True):
-        base = GeomagneticNavEnv(num_envs=40, seed=0)
-        navigator = make_navigator(name, base, sensor_std=biased.std)
+        base = GeomagneticNavEnv(num_envs=30, seed=0)
+        navigator = make_navigator("secant", base, sensor_std=biased.std)
         assert navigator.search
         navigator.search = search
         rollout = evaluation_rollout(with_conditions(base, biased, seed=0), navigator)
         rates.append(summarize(episode_measures(rollout))["success_rate"])
     assert rates[1] > 90 > 70 > rates[0]
-    declared = GeomagneticNavEnv(num_envs=2, seed=0, arrival="declared")
-    assert not make_navigator(name, declared).search
+    assert not make_navigator("secant", GeomagneticNavEnv(num_envs=2, seed=0, arrival="declared")).search
 
 
 def test_dead_reckoning_declares_at_the_reckoned_destination() -> None:
@@ -84,33 +77,18 @@ def test_dead_reckoning_declares_at_the_reckoned_destination() -> None:
     assert geodesic(*end["position"].T, *end["target_position"].T)[0].max() < 0.5
 
 
-def test_steer_by_hand() -> None:
-    distance, turn = steer(
-        torch.tensor([3.0, 0.0, 0.0, 0.0]),
-        torch.tensor([-3.0, 1.0, 3.0, 0.5]),
-        torch.tensor([20.0, 80.0, 80.0, -1.0]),
-        50.0,
-        math.pi / 2,
-    )
-    torch.testing.assert_close(turn, torch.tensor([2 * math.pi - 6, 1.0, math.pi / 2, 0.5]))
-    torch.testing.assert_close(distance, torch.tensor([20.0, 50.0, 0.0, 0.0]))
-
-
 def test_displacement_solves_consistent_equations() -> None:
-    draw = torch.Generator().manual_seed(0)
-    for elements in (2, 3):
-        for shape in ((), (4,), (2, 3)):
-            jacobian = torch.randn(*shape, elements, 2, dtype=torch.float64, generator=draw)
-            way = torch.randn(*shape, 2, dtype=torch.float64, generator=draw)
-            error = (jacobian @ way.unsqueeze(-1)).squeeze(-1)
-            torch.testing.assert_close(displacement_to(error, jacobian), way, atol=1e-5, rtol=1e-5)
-
-
-def test_displacement_is_finite_without_a_gradient() -> None:
-    for dtype in (torch.float32, torch.float64):
-        assert torch.isfinite(displacement_to(torch.ones(2, dtype=dtype), torch.zeros(2, 2, dtype=dtype))).all()
-        parallel = torch.tensor([[1.0, 1.0], [1.0, 1.0]], dtype=dtype)
-        assert torch.isfinite(displacement_to(torch.tensor([1.0, 2.0], dtype=dtype), parallel)).all()
+    """And is finite without a gradient across a line, or any."""
+    for elements, shape in (2, ()), (2, (4,)), (3, (2, 3)):
+        jacobian, way = randn(*shape, elements, 2), randn(*shape, 2, seed=1)
+        error = (jacobian @ way.unsqueeze(-1)).squeeze(-1)
+        torch.testing.assert_close(displacement_to(error, jacobian), way, atol=1e-5, rtol=1e-5)
+    for dtype, slope in itertools.product((torch.float32, torch.float64), (0, 1)):
+        assert (
+            displacement_to(torch.tensor([1.0, 2.0], dtype=dtype), torch.full((2, 2), slope, dtype=dtype))
+            .isfinite()
+            .all()
+        )
 
 
 @pytest.mark.parametrize("turn", [math.pi / 2, 0.5])
@@ -141,14 +119,14 @@ def test_a_navigator_flies_about_the_shortest_path(env, name: str, spl: float, s
     assert summary["spl"] > spl
     assert summary["steps"] < steps
     assert navigator.oracle == (name == "parallel")
-    assert navigator.field_readings.tolist() == [0] * 100
+    assert not navigator.field_readings.any()
 
 
 def test_parallel_and_secant_arrive_where_the_papers_pair_fails() -> None:
     """In the Arabian Sea the gradients of D and I are parallel along a line."""
     scenario = Scenario(region=Region((4, 14), (66, 76)), objective_floors=None)
-    scenario = scenario.with_tasks(scenario.random_tasks(100, seed=1))
-    sea = GeomagneticNavEnv(scenario, num_envs=100, seed=0)
+    scenario = scenario.with_tasks(scenario.random_tasks(40, seed=1))
+    sea = GeomagneticNavEnv(scenario, num_envs=40, seed=0)
     assert flown(sea, ParallelApproach(sea.field, pair=("D", "I")))["success_rate"] < 90
     assert flown(sea, Secant(elements=("D", "I")))["success_rate"] < 90
     assert flown(sea, ParallelApproach(sea.field))["success_rate"] == 100
@@ -156,7 +134,7 @@ def test_parallel_and_secant_arrive_where_the_papers_pair_fails() -> None:
 
 
 def test_secant_on_two_elements_and_narrow_turns() -> None:
-    env = GeomagneticNavEnv(Scenario(tasks=task_set(50, seed=72)), num_envs=50, seed=0, max_turn_deg=math.degrees(1.0))
+    env = GeomagneticNavEnv(Scenario(tasks=task_set(20, seed=72)), num_envs=20, seed=0, max_turn_deg=math.degrees(1.0))
     assert flown(env, Secant(50.0, 1.0, elements=("D", "I")))["success_rate"] >= 98
 
 
@@ -193,13 +171,13 @@ def test_each_navigator_declares_what_it_is() -> None:
         assert not kind.oracle or "an oracle" in kind.description
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", sorted(NAVIGATORS))
 def test_every_navigator_stays_in_bounds_and_reads_what_it_declares(name: str) -> None:
     """Bounds that are not the default; no key is optional."""
-    env = GeomagneticNavEnv(num_envs=6, seed=4, max_move_km=8.0, max_turn_deg=math.degrees(0.7), start_heading="random")
+    env = GeomagneticNavEnv(num_envs=3, seed=4, max_move_km=8.0, max_turn_deg=math.degrees(0.7), start_heading="random")
     navigator, other = (NAVIGATORS[name].for_env(env) for _ in range(2))
     state, longest = env.reset(), torch.zeros(())
-    for _ in range(12):
+    for _ in range(6):
         action = navigator(state.clone())["action"]
         if "seed" not in navigator.options:  # whose second call takes other random numbers
             assert torch.equal(navigator(state.clone())["action"], action)
@@ -213,7 +191,7 @@ def test_every_navigator_stays_in_bounds_and_reads_what_it_declares(name: str) -
             other(state.exclude(key))
 
 
-@pytest.mark.parametrize("name", ["secant", "kalman", "mean_jacobian", "parallel"])
+@pytest.mark.parametrize("name", ["secant", "kalman", "parallel"])
 def test_declination_continues_across_half_a_turn(env, name: str) -> None:
     """D from -180 to 180 gives the moves of D without that jump."""
 
@@ -243,7 +221,7 @@ def test_a_new_episode_begins_a_new_memory_for_its_vehicle_alone(env) -> None:
     state = env.reset()
     for _ in range(4):
         state = env.step(navigator(state))["next"]
-    began = torch.arange(100) % 3 == 0
+    began = torch.arange(30) % 3 == 0
     first = env.reset()
     mixed = torch.where(began, first.select(*navigator.in_keys), state.select(*navigator.in_keys))
     going = copy.deepcopy(navigator)(state.clone())["action"]
@@ -255,24 +233,27 @@ def test_a_new_episode_begins_a_new_memory_for_its_vehicle_alone(env) -> None:
 
 
 def test_secant_stands_a_field_without_change() -> None:
-    state = GeomagneticNavEnv(num_envs=2, seed=0).reset()
-    navigator = Secant()
+    state, navigator = GeomagneticNavEnv(num_envs=2, seed=0).reset(), Secant()
     for step in range(5):
         state["elapsed_steps"] = torch.full((2, 1), step)
         state["move"] = torch.tensor([[10.0, 0.0]]).expand(2, 2) * (step > 0)
         assert torch.isfinite(navigator(state)["action"]).all()
 
 
-def test_bad_options_are_refused_with_their_value() -> None:
-    for options, message in (
-        ({"max_turn_rad": 4.5}, "4.5"),
-        ({"probe_km": 60.0}, "60.0"),
-        ({"elements": ("D",)}, "'D'"),
-        ({"elements": ("D", "D")}, "'D', 'D'"),
-        ({"elements": ("D", "X")}, "'X'"),
+def test_bad_options_are_refused_with_their_value(env) -> None:
+    grid = torch.zeros(2, 2)
+    for make, message in (
+        (lambda: Secant(max_turn_rad=4.5), "4.5"),
+        (lambda: Secant(probe_km=60.0), "60.0"),
+        (lambda: Secant(elements=("D",)), "'D'"),
+        (lambda: Secant(elements=("D", "D")), "'D', 'D'"),
+        (lambda: Secant(elements=("D", "X")), "'X'"),
+        (lambda: MeanJacobian(env.field, grid[:1]), r"two places.*\(1, 2\)"),
+        (lambda: MeanJacobian(len, grid), "field must have value_and_gradient"),
+        (lambda: ParallelApproach(len), "field must have value_and_gradient"),
     ):
         with pytest.raises(ValueError, match=message):
-            Secant(**options)
+            make()
 
 
 def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
@@ -287,19 +268,10 @@ def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
     assert torch.equal(*flights)
 
 
-def test_maps_and_pairs_are_checked(env) -> None:
-    with pytest.raises(ValueError, match=r"two places.*\(1, 2\)"):
-        MeanJacobian(env.field, torch.zeros(1, 2))
-    for kind in (ParallelApproach, lambda field: MeanJacobian(field, torch.zeros(2, 2))):
-        with pytest.raises(ValueError, match="field must have value_and_gradient"):
-            kind(len)
-
-
-@pytest.mark.parametrize("name", ["secant", "mean_jacobian"])
-def test_a_reading_that_is_nan_is_not_flown(env, name: str) -> None:
+def test_a_reading_that_is_nan_is_not_flown(env) -> None:
     """A NaN action, which the environment refuses, and not a move by a guess; other vehicles go on."""
     env.set_seed(0)
-    navigator, state = NAVIGATORS[name].for_env(env), env.reset()
+    navigator, state = Secant(), env.reset()
     for _ in range(3):
         state = env.step(navigator(state))["next"]
     state["field"][3] = torch.nan

@@ -25,7 +25,7 @@ from magrl.evaluation.navigators import fitted, make_navigator
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move, move_place
 from magrl.navigators import Anywhere, Navigator
-from magrl.sensor_std import PERFECT, SensorStd
+from magrl.sensor_std import SensorStd
 from magrl.tracking import Rules, load_pilot, save_pilot
 from magrl.tracking.network import pretrained
 from magrl.transforms import MagneticNorth, SensorErrors
@@ -94,18 +94,20 @@ def check(command: Command, policy: Navigator, after: TensorDictBase) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "noise", "stated", "north"),
+    ("name", "noise", "stated", "north", "missed"),
     [
-        ("anywhere", NONE, 1.0, "true"),
-        ("anywhere", (0.1, 0.1, 10.0), 2.5, "true"),
-        ("kalman", (0.05, 0.05, 5.0), 0.4, "true"),
-        ("secant", NOISE, 1.0, "magnetic"),
+        ("kalman", (0.05, 0.05, 5.0), 2.5, "true", 0.0),
+        ("secant", NOISE, 1.0, "magnetic", 0.0),
+        ("memory", NOISE, 1.0, "true", 0.5),
     ],
 )
-def test_commands_are_those_of_the_environment(name: str, noise: Triple, stated: float, north: str) -> None:
-    """Over a whole episode, with the declaration at its end; also where other noise is stated, and without D."""
+def test_commands_are_those_of_the_environment(
+    name: str, noise: Triple, stated: float, north: str, missed: float
+) -> None:
+    """Over a whole episode, with the declaration at its end; also where other noise is stated, without D, and where
+    readings are missed: the vehicle gets None, the policy in the environment the last reading with a large error."""
     base, magnetic, sensor_std = nav(), north == "magnetic", tuple(stated * std for std in noise)
-    env = TransformedEnv(base, SensorErrors(noise, seed=3), auto_unwrap=True)
+    env = TransformedEnv(base, SensorErrors(noise, outage_rate=missed, seed=2), auto_unwrap=True)
     env = TransformedEnv(env, MagneticNorth(), auto_unwrap=True) if magnetic else env
     if stated != 1:
         env = TransformedEnv(env, ObservationNorm(0.0, stated, in_keys=["sensor_std"]), auto_unwrap=True)
@@ -114,16 +116,16 @@ def test_commands_are_those_of_the_environment(name: str, noise: Triple, stated:
     restart(env)
     target = env.reset()["target_field"][0].tolist()
     vehicle.start((None, *target[1:]) if magnetic else target)
-    flown = list(fly(env, policy, vehicle, none=int(magnetic)))
-    for command, _, after in flown:
-        check(command, policy, after) if command is flown[-1][0] else None
-        distance, turn = after["move"][0].tolist()
-        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
-    assert len(flown) > 5
-    assert after["success"].item() or stated != 1
+    outages = []
+    for command, state, after in fly(env, policy, vehicle, 8 if missed else 99, none=int(magnetic)):
+        check(command, policy, after)
+        outages.append(state["sensor_std"].max().item() > 100)
+    assert len(outages) > 5
+    assert after["success"].item() or stated != 1 or missed
+    assert (0 < sum(outages) < len(outages)) == (missed > 0)
 
 
-@pytest.mark.parametrize("name", ["anywhere", "kalman", "secant"])
+@pytest.mark.parametrize("name", ["kalman", "secant"])
 def test_a_known_start_shows_constant_errors(name: str, tmp_path: Path) -> None:
     """The commands are about those of sensors without them; also for a vehicle that is restored."""
     base, bias = nav(), (0.4, 0.1, -30.0)
@@ -155,21 +157,6 @@ def test_a_start_that_is_hardly_known_shows_no_constant_error() -> None:
         found, wanted = (vehicle.step(*reading.tolist(), course, math.hypot(*way)) for vehicle in (told, untold))
         assert (found.stop, found.distance_km) == (None, pytest.approx(wanted.distance_km, abs=0.1))
         assert math.remainder(found.heading_deg - wanted.heading_deg, 360) == pytest.approx(0, abs=0.1)
-
-
-@pytest.mark.parametrize("name", ["anywhere", "secant", "memory"])
-def test_missed_readings_are_the_outages_of_the_environment(name: str) -> None:
-    """The vehicle gets None, the policy in the environment the last reading with a large standard deviation."""
-    base = nav()
-    env = TransformedEnv(base, SensorErrors(NOISE, outage_rate=0.5, seed=2))
-    policy = navigator(name, base, NOISE)
-    restart(env)
-    vehicle = begun(name, env.reset()["target_field"][0].tolist(), sensor_std=NOISE, max_steps=50, confidence=0.0)
-    missed = 0
-    for command, state, after in fly(env, policy, vehicle, 8):
-        check(command, policy, after)
-        missed += state["sensor_std"].max().item() > 100
-    assert 0 < missed < 8
 
 
 def region_policy() -> FieldPolicy:
@@ -222,27 +209,22 @@ def profile(frame, event, argument):
         functions.add((code.co_filename, code.co_qualname))
         calls += 1
     others += "torchrl" in code.co_filename or "tensordict" in code.co_filename
-for name in ("anywhere", "kalman"):
-    functions, calls, others = set(), 0, 0
-    vehicle = Onboard(name, sensor_std=(0.02, 0.02, 2.0))
-    vehicle.start((-11.6, 75.4, 13240.0))
-    vehicle.step(3.5, 73.0, 15000.0, 290.0)
-    vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
-    sys.setprofile(profile)
-    vehicle.step(3.3, 73.1, 14985.0, 290.0, 20.0)
-    sys.setprofile(None)
-    print(len(functions), calls, others, any(name in sys.modules for name in ("torchrl", "tensordict")))
+functions, calls, others = set(), 0, 0
+vehicle = Onboard("anywhere", sensor_std=(0.02, 0.02, 2.0))
+vehicle.start((-11.6, 75.4, 13240.0))
+vehicle.step(3.5, 73.0, 15000.0, 290.0)
+vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
+sys.setprofile(profile)
+vehicle.step(3.3, 73.1, 14985.0, 290.0, 20.0)
+sys.setprofile(None)
+print(len(functions), calls, others + sum(name in sys.modules for name in ("torchrl", "tensordict")))
 """
 
 
 def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
     run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, encoding="utf-8")
-    rows = [line.split() for line in run.stdout.splitlines()]
-    assert len(rows) == 2
-    for functions, calls, *others in rows:
-        assert others == ["0", "False"]
-        assert int(functions) <= 144
-        assert int(calls) <= 715
+    functions, calls, others = map(int, run.stdout.split())
+    assert (functions <= 144, calls <= 715, others) == (True, True, 0)
 
 
 # A known start
@@ -336,7 +318,7 @@ def test_a_way_that_is_longer_than_a_move_is_reported_in_parts() -> None:
 # State
 
 
-@pytest.mark.parametrize("name", ["anywhere", "secant", "memory"])
+@pytest.mark.parametrize("name", ["secant", "memory"])
 def test_a_restored_vehicle_goes_on_bit_for_bit(name: str, tmp_path: Path) -> None:
     """From each step on, also after a missed reading, whatever kind of number was given."""
     first, path = Onboard(name, sensor_std=np.float32(NOISE), max_steps=np.int64(50)), tmp_path / "state"
@@ -423,22 +405,20 @@ def test_readings_all_over_the_earth_are_taken() -> None:
 # Stops
 
 
-@pytest.mark.parametrize("name", ["anywhere", "secant", "memory"])
-def test_a_log_in_radians_at_middle_latitudes_is_never_an_arrival(name: str) -> None:
+def test_a_log_in_radians_at_middle_latitudes_is_never_an_arrival() -> None:
     """A reading of 0.66 is possible at the magnetic equator; that it hardly changes along the way is not."""
-    place, heading = [26.0, 30.0], 0.0
+    place, command, distance = torch.tensor([26.0, 30.0]).double(), None, 0.0
 
-    def reading(place: list[float]) -> list[float]:
-        d, i, h = at(*place)
+    def reading(latitude: float, longitude: float) -> list[float]:
+        d, i, h = at(latitude, longitude)
         return [math.radians(d), math.radians(i), h]
 
-    vehicle = begun(name, reading([28.5, 32.0]))
-    command = vehicle.step(*reading(place), heading)
-    for _ in range(13):
-        distance, heading = command.distance_km or 20.0, math.radians(command.heading_deg)
-        place[0] += distance / 111.2 * math.cos(heading)
-        place[1] += distance / 111.2 * math.sin(heading) / math.cos(math.radians(place[0]))
-        command = vehicle.step(*reading(place), command.heading_deg, distance)
+    vehicle = begun("secant", reading(28.5, 32.0))
+    for _ in range(14):
+        heading = command.heading_deg if command else 0.0
+        place = move_place(place, torch.tensor(heading).deg2rad().double(), torch.tensor(distance).double())
+        command = vehicle.step(*reading(*place.tolist()), heading, distance)
+        distance = command.distance_km or 20.0
         if command.stop:
             break
     assert command.stop == "lost"
@@ -449,7 +429,7 @@ def test_the_magnetic_equator_is_no_log_in_radians() -> None:
     latitudes = torch.arange(8.0, 11.0, 0.1, dtype=torch.float64)
     dips = elements_at(IGRF("2026-06-30"), torch.stack((latitudes, torch.full_like(latitudes, 33.0)), -1))[:, 1]
     equator, vehicle = latitudes[dips.abs().argmin()].item(), begun(target=at(8.0, 40.0))
-    for number, longitude in enumerate(np.arange(31.5, 34.5, 0.3)):
+    for number, longitude in enumerate(np.arange(31.5, 33.3, 0.3)):
         here = at(equator, longitude)
         assert abs(here[1]) < 1.57
         assert vehicle.step(*here, 90.0, 32.9 if number else 0.0).stop is None
@@ -464,17 +444,6 @@ def test_the_last_step_stops_and_says_how_near() -> None:
     assert (stops[-1].distance_km, stops[-1].turn_deg) == (0.0, 0.0)
 
 
-def test_readings_that_scatter_more_than_is_stated_are_no_track() -> None:
-    """Noise of 0.5 degrees and 50 nT of sensors that are stated as perfect, and with this noise."""
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(12, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 0.5, 50.0])
-    readings, stops = (torch.tensor(HERE) + noise).tolist(), []
-    for sensor_std in (PERFECT, SensorStd((0.5, 0.5, 50.0))):
-        vehicle = begun(sensor_std=sensor_std)
-        stops.append({vehicle.step(*r, 290.0, 1.0 if k else 0.0).stop for k, r in enumerate(readings)})
-    assert stops == [{None, "lost"}, {None}]
-
-
 @pytest.mark.parametrize(
     ("sign", "zero", "lost"),
     [(1.0, 0.0, False), (-1.0, 0.0, True), (-1.0, 90.0, True)],
@@ -484,7 +453,7 @@ def test_readings_of_no_field_are_noticed(sign: float, zero: float, lost: bool) 
     """Inclinations with another sign, or from the vertical, have a curl and a divergence after two moves."""
     latitude, longitude, heading = (torch.tensor(x, dtype=torch.float64) for x in (30.0, 30.0, 1.0))
     stops = []
-    for step in range(6):
+    for step in range(4):
         d, i, b_h = at(latitude.item(), longitude.item())
         if not step:
             vehicle = begun("kalman", (d + 2.0, sign * i + zero + 2.0, b_h - 800.0), sensor_std=NOISE)
@@ -492,49 +461,34 @@ def test_readings_of_no_field_are_noticed(sign: float, zero: float, lost: bool) 
         stops.append(vehicle.step(d, sign * i + zero, b_h, course, 50.0 if step else 0.0).stop)
         heading = heading + 0.6
         latitude, longitude = move(latitude, longitude, heading, torch.full_like(heading, 50.0))
-    assert ("lost" in stops[2:4]) == lost
-    assert "lost" in stops or not lost
-
-
-def test_out_of_range_on_the_way() -> None:
-    weak = begun("anywhere", (0.0, 88.0, 2100.0))
-    weak.step(0.0, 87.9, 2100.0, 0.0)
-    command = weak.step(0.0, 88.1, 1990.0, 0.0, 20.0)
-    assert (command.stop, command.distance_km) == ("out of range", 0.0)
-    assert "B_H 1990 nT is out of the range of the navigator" in command.reason
+    assert ("lost" in stops[2:]) == lost
 
 
 @pytest.mark.parametrize(
-    ("held", "moves", "reason"),
+    ("held", "std", "moves", "reason"),
     [
-        ((0, 1, 2), 4, "no change of D, I, B_H over 100 km: a sensor is stuck"),
-        ((1,), 14, "no change of I over 400 km: a sensor is stuck"),
-        ((), None, ""),
+        ((0, 1, 2), (0.5, 0.5, 50.0), 2, "no change of D, I, B_H over 100 km: a sensor is stuck"),
+        ((1,), (0.5, 0.5, 50.0), 8, "no change of I over 400 km: a sensor is stuck"),
+        ((), (0.5, 0.5, 50.0), None, ""),
+        ((0,), (5.0, *NOISE[1:]), None, ""),
+        ((1,), (NOISE[0], 1e4, NOISE[2]), None, ""),
+        ((2,), (*NOISE[:2], 5000.0), None, ""),
     ],
 )
-def test_a_stuck_sensor(held: tuple[int, ...], moves: int | None, reason: str) -> None:
-    """Moves of 30 km on a straight track where readings change."""
-    vehicle = begun(sensor_std=(0.5, 0.5, 50.0))
-    for step in range(15):
-        reading = [value + 1e-3 * step * (index not in held) for index, value in enumerate(HERE)]
-        command = vehicle.step(*reading, 290.0, 30.0 if step else 0.0)
-        assert (command.reason if step == moves else command.stop) == (reason if step == moves else None)
-        if step == moves:
-            assert command.stop == "lost"
-            break
-
-
-@pytest.mark.parametrize(("useless", "std"), [(0, 5.0), (1, 1e4), (2, 5000.0)])
-def test_an_element_that_is_stated_as_useless_never_ends_a_way(useless: int, std: float) -> None:
-    """Its sensor always shows the same, even an inclination that looks like radians."""
-    here = [3.5, 1.3, 30000.0] if useless == 1 else list(HERE)
-    noise = [std if i == useless else NOISE[i] for i in range(3)]
-    vehicle = begun(target=[-1.0, 4.0, 30500.0] if useless == 1 else TARGET, sensor_std=noise)
-    for step in range(15):
-        reading = [value + (0.01, 0.02, 2.0)[i] * step * (i != useless) for i, value in enumerate(here)]
-        command = vehicle.step(*reading, 0.0, 30.0 if step else 0.0)
-        assert command.stop != "lost"
+def test_a_stuck_sensor(held: tuple[int, ...], std: Triple, moves: int | None, reason: str) -> None:
+    """Moves of 50 km along which readings change, but those of a sensor that always shows the same; where it is stated
+    as useless, it never ends a flight, even with an inclination that looks like radians."""
+    radians = std[1] == 1e4
+    here, target = ((3.5, 1.3, 30000.0), (-1.0, 4.0, 30500.0)) if radians else (HERE, TARGET)
+    vehicle = begun(target=target, sensor_std=std)
+    for step in range(9):
+        reading = [x + (0.01, 0.02, 2.0)[n] * step * (n not in held) for n, x in enumerate(here)]
+        command = vehicle.step(*reading, 290.0, 50.0 if step else 0.0)
+        assert (command.stop == "lost") == (step == moves)
         assert math.isfinite(command.turn_deg + command.error_km)
+        if step == moves:
+            assert command.reason == reason
+            break
 
 
 def test_a_vehicle_without_true_north_takes_no_declination() -> None:
@@ -546,16 +500,3 @@ def test_a_vehicle_without_true_north_takes_no_declination() -> None:
     assert 0 < command.axes[1] < command.axes[0]
     first = begun("kalman", TARGET, HERE, sensor_std=NOISE).step(*HERE, 290.0)
     assert replace(first, reason="") == first
-
-
-@pytest.mark.parametrize(("radius_km", "stop"), [(25.0, None), (400.0, "arrived")])
-def test_the_rule_of_arrival(radius_km: float, stop: str | None) -> None:
-    """At about 150 km from the destination, after a turn."""
-    place = torch.tensor([-100.0, -100.0])
-    vehicle = begun(target=HERE, radius_km=radius_km, sensor_std=NOISE)
-    for number, way in enumerate(([0.0, 0.0], [30.0, 0.0], [0.0, 30.0], [-20.0, 0.0], [0.0, -40.0])):
-        place, heading = place + torch.tensor(way), math.degrees(math.atan2(way[1], way[0]))
-        command = vehicle.step(*(torch.tensor(HERE) + SLOPE @ place).tolist(), heading, math.hypot(*way))
-        assert number == 0 or command.stop in (None, stop)
-    assert math.dist(command.way_km, (-place).tolist()) < 50
-    assert command.stop == stop

@@ -16,9 +16,8 @@ ROWS = ("0,15000,1000,48000,350", "1,15100,1100,48100,10", "2,15200,1200,48200,3
 
 
 def written(folder: Path, *rows: str, header: str = HEADER) -> Path:
-    path = folder / "log.csv"
-    path.write_text("\n".join([header, *rows]), encoding="utf-8")
-    return path
+    (folder / "log.csv").write_text("\n".join([header, *rows]), encoding="utf-8")
+    return folder / "log.csv"
 
 
 @pytest.mark.parametrize(
@@ -44,23 +43,14 @@ def test_each_unit_of_each_column() -> None:
             assert {unit_of(header("any", unit), kind) for header in headers} == {size}
 
 
-@pytest.mark.parametrize(
-    ("name", "north"), [("heading_true_deg", "true"), ("mag_heading", "magnetic"), ("heading", None)]
-)
-def test_the_north_of_a_column(tmp_path: Path, name: str, north: str | None) -> None:
-    assert read_log(written(tmp_path, *ROWS, header=HEADER.replace("heading_true_deg", name))).north == north
+def test_the_north_of_a_column(tmp_path: Path) -> None:
+    for name, north in {"heading_true_deg": "true", "mag_heading": "magnetic", "heading": None}.items():
+        assert read_log(written(tmp_path, *ROWS, header=HEADER.replace("heading_true_deg", name))).north == north
 
 
 def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
     """Headings through north; positions that are slower than the magnetometer; rows without axes are left out."""
-    rows = (
-        "0,0,0,5e4,350,10",
-        "1,0,0,5e4,,",
-        "1.5,,,,,",
-        "1.7,0,0,0,,",
-        "2,0,0,5e4,10,12",
-        "3,0,0,5e4,20,",
-    )
+    rows = "0,0,0,5e4,350,10", "1,0,0,5e4,,", "1.5,,,,,", "1.7,0,0,0,,", "2,0,0,5e4,10,12", "3,0,0,5e4,20,"
     samples = read_log(written(tmp_path, *rows, header=HEADER + ",lat")).samples
     assert samples["time"].tolist() == [0, 1, 2, 3]
     assert samples["heading"].tolist() == pytest.approx([350, 0, 10, 20])
@@ -69,28 +59,18 @@ def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
 
 def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
     """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
-    rows = (
-        "0,0,0,5e4,0,0",
-        "1,0,0,5e4,0,5",
-        "1,0,0,5e4,0,5",
-        "2,0,0,0,0,7",
-        "3,,,,0,1",
-        "4,0,0,5e4,0,2",
-    )
+    rows = "0,0,0,5e4,0,0", "1,0,0,5e4,0,5", "1,0,0,5e4,0,5", "2,0,0,0,0,7", "3,,,,0,1", "4,0,0,5e4,0,2"
     samples = read_log(written(tmp_path, *rows, header=HEADER + ",distance_km")).samples
     assert samples["distance"].tolist() == [0, 5, 10]
 
 
-@pytest.mark.parametrize(
-    ("rows", "note"),
-    [
+def test_notes(tmp_path: Path) -> None:
+    for rows, note in (
         ([*ROWS, "3,15300"], "the last row is not complete, and is left out: the log"),
         ([*ROWS[:2], *ROWS[1:]], "1 of 4 samples left out: without a new time"),
         ([*ROWS, "3,0,0,0,40"], "1 of 4 samples left out"),
-    ],
-)
-def test_notes(tmp_path: Path, rows, note: str) -> None:
-    assert any(re.match(note, text) for text in read_log(written(tmp_path, *rows)).notes)
+    ):
+        assert any(re.match(note, text) for text in read_log(written(tmp_path, *rows)).notes)
 
 
 WHOLE = HEADER + ",roll_deg,pitch_deg,speed_m_s,distance_km,lat_deg,lon_deg,alt_m"
