@@ -7,48 +7,20 @@ import math
 import pytest
 import torch
 from support.tracks import F64, STD, f64, randn, unknown
-from torch import Tensor
 from torch.nn.functional import pad
 
 from magrl.field import IGRF, FieldBank, SphericalHarmonicField, elements_at, random_planets
 from magrl.field.elements import elements_gradient, elements_jacobian, field_vector, measured_elements
-from magrl.field.harmonics import basis, field_table
 from magrl.geodesy import geodesic, move
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import Belief, before, destination, elements, innovation, known, mode, moved, posterior, read, start
-from magrl.tracking.belief import (
-    ANOMALY,
-    ANOMALY_KM,
-    CONSTANT,
-    IRON,
-    MODEL_NT,
-    STATES,
-)
+from magrl.tracking.belief import ANOMALY, ANOMALY_KM, CONSTANT, IRON, MODEL_NT, STATES
 from magrl.tracking.destination import log_density
-from magrl.tracking.harmonics import RADIUS, field_rows, generators, orders, powers, size, turning
+from magrl.tracking.harmonics import generators, orders, size, turning
 from magrl.tracking.local import COEFFICIENTS
-from magrl.tracking.prior import lasting_covariances, latitude_cells
+from magrl.tracking.prior import lasting_covariances
 
 NOISE = f64(*STD)
-
-
-def local_coefficients(gauss: Tensor, latitude: float, degree: int) -> Tensor:
-    """Coefficients of planets on the meridian of Greenwich of a sphere: fitted to the field along moves."""
-    reach, (n, _) = 0.08, torch.tensor(orders(degree)).mT
-    way = torch.cartesian_prod(*2 * [torch.linspace(-reach, reach, 9, dtype=F64)])
-    rows = torch.tensordot(powers(way, 9), field_rows(degree, 9), 1)
-    cos, sin, turn = (
-        math.cos(math.radians(latitude)),
-        math.sin(math.radians(latitude)),
-        f64(0.0).expand(len(way), 3, 3).clone(),
-    )
-    turn[:, :2, 2], turn[:, 2, :2] = way / RADIUS, -way / RADIUS
-    here = f64((-sin, 0.0, cos), (0.0, 1.0, 0.0), (-cos, 0.0, -sin))  # north, east, down
-    axes = torch.linalg.matrix_exp(turn) @ here  # carried along the great circle
-    field = field_table(gauss) @ basis(-axes[:, 2] * RADIUS * 1000, gauss.shape[-1])  # (..., 3, M)
-    field = (axes @ field.mT.unsqueeze(-1)).squeeze(-1).flatten(-2)
-    scale = reach ** (1.0 - n)  # else, the rank is lost
-    return torch.linalg.lstsq(rows.flatten(0, 1) * scale, field.mT).solution.mT * scale
 
 
 def sure_belief(planet: SphericalHarmonicField, latitude: float, longitude: float) -> Belief:
@@ -77,21 +49,7 @@ def test_generators_are_derivatives_and_turns() -> None:
     assert turn.shape[-1] == size(4)
 
 
-def test_the_prior_has_the_moments_of_sampled_planets() -> None:
-    """Of 8000 planets at 57.5 degrees: each mean and standard deviation, and the correlations."""
-    cells, planets = latitude_cells(), random_planets(8_000, seed=1)
-    index = int(torch.argmin((cells.latitude - math.radians(57.5)).abs()))
-    sample = local_coefficients(planets, 57.5, 8)[:, :COEFFICIENTS]
-    field, gain, rest = (part[index] for part in (cells.field_covariance, cells.gain, cells.covariance))
-    lever = torch.cat((torch.eye(3, dtype=F64), gain))
-    covariance = (lever @ field @ lever.mT + pad(rest, (3, 0, 3, 0)))[:COEFFICIENTS, :COEFFICIENTS]
-    scale = covariance.diagonal().rsqrt()
-    apart = (sample - cells.mean[index]) * scale
-    assert apart.mean(0).abs().max() < 0.05
-    torch.testing.assert_close(apart.mT @ apart / len(sample), covariance * scale * scale[:, None], rtol=0, atol=0.08)
-
-
-@pytest.mark.parametrize(("latitude", "course"), [(50.0, 1.0), (-20.0, 4.0), (75.0, 2.0)])
+@pytest.mark.parametrize(("latitude", "course"), [(-20.0, 4.0), (75.0, 2.0)])
 def test_a_move_takes_the_field_and_its_gradient_along(latitude: float, course: float) -> None:
     """Six moves of 50 km: 1 nT, the gradients to 0.01 nT/km; and the latitude's column by differences."""
     planet = SphericalHarmonicField(random_planets(1, seed=5)[0])
@@ -253,7 +211,7 @@ def test_it_is_as_sure_as_it_is_right_on_random_planets(bias: float, least: floa
 
     Without true north, headings and the way are from magnetic north, and a reading has two elements.
     """
-    count, magnetic = 256, math.isinf(bias)
+    count, magnetic = 128, math.isinf(bias)
     errors = SensorStd(NOISE, *(f64(*kind).expand(count, 3) for kind in ((bias, 0.0, 0.0), *[(0.0,) * 3] * 2)))
     draw = [torch.rand(count, generator=torch.Generator().manual_seed(seed)).double() for seed in (2, 3)]
     latitude, heading = torch.rad2deg(torch.asin(1.7 * draw[0] - 0.85)), 6 * draw[1]

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from magrl import IGRF, evaluate
-from magrl.envs import earth_scenario
+from magrl.envs import Scenario, earth_scenario
 from magrl.field.elements import elements_jacobian, measured_elements
 from magrl.geodesy import geodesic, move, move_place
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import EarthModel, Motion, Rules, destination, earth, earth_model, posterior, start
-from magrl.tracking.belief import DRIFT, PLACE, at_place, moved, read
+from magrl.tracking.belief import DRIFT, PLACE, at_place, before, moved, read
 from magrl.tracking.earth import secular_variance
 from magrl.tracking.local import slopes
 from magrl.tracking.prior import lasting_covariances
@@ -33,10 +33,7 @@ def test_local_coefficients_have_the_field_and_its_slopes() -> None:
     coefficients = model.coefficients(PLACES)
     torch.testing.assert_close(coefficients[:, :3], model.field(*PLACES.unbind(-1)), rtol=0, atol=1e-6)
     for axis, bearing in enumerate((0.0, math.pi / 2)):
-        course, half = (
-            torch.full((len(PLACES),), bearing, dtype=torch.float64),
-            torch.full((len(PLACES),), 0.5).double(),
-        )
+        course, half = (torch.full((len(PLACES),), x, dtype=torch.float64) for x in (bearing, 0.5))
         ends = [model.field(*move(*PLACES.unbind(-1), course + turn, half)) for turn in (0.0, math.pi)]
         torch.testing.assert_close(slopes(coefficients, PLACES)[:, :3, axis], ends[0] - ends[1], rtol=0, atol=0.02)
 
@@ -110,8 +107,6 @@ def test_secular_change(years: float, predicted: bool, fields: tuple[float, floa
 def test_an_old_model_places_a_vehicle_without_a_place() -> None:
     place = torch.tensor([[50.0, 10.0]], dtype=torch.float64)
     reading, std = measured_elements(IGRF("2025-01-01")(*place.unbind(-1))), std_of((0.1, 0.1, 10.0), count=1)
-    from magrl.tracking.belief import before
-
     belief = before(reading, std, model=earth_model("IGRF-2005", "2025-01-01"))
     assert abs(belief.latitude.item() - 50.0) < 3.0
     assert not belief.located.any()
@@ -140,39 +135,35 @@ def test_a_destination_out_of_reach_is_not_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "date", "message"),
+    ("call", "message"),
     [
-        ("IGRF-12", "2025-01-01", "model 'IGRF-12' must be IGRF-13, IGRF-14"),
-        ("IGRF-13", "2026-06-01", "model IGRF-13 is valid to 2025, not in 2026.4"),
-        ("IGRF-2030", "2025-01-01", "from 1900 to 2025"),
+        (lambda: earth_model("IGRF-12", "2025-01-01"), "model 'IGRF-12' must be IGRF-13, IGRF-14"),
+        (lambda: earth_model("IGRF-13", "2026-06-01"), "model IGRF-13 is valid to 2025, not in 2026.4"),
+        (lambda: earth_model("IGRF-2030", "2025-01-01"), "from 1900 to 2025"),
+        (lambda: Rules(start_km=5.0), "needs a model"),
+        (lambda: Rules(target_km=5.0), "start_km"),
     ],
 )
-def test_models_that_do_not_cover_the_date(model: str, date: str, message: str) -> None:
+def test_models_and_rules_that_do_not_fit(call, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        earth_model(model, date)
+        call()
 
 
-@pytest.mark.parametrize(("rules", "message"), [({"start_km": 5.0}, "needs a model"), ({"target_km": 5.0}, "start_km")])
-def test_rules_that_do_not_fit(rules: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Rules(**rules)
+def scenario_of(latitude: float) -> Scenario:
+    scenario = earth_scenario(8, 3, max_move_km=90.0, max_latitude=latitude, distance_range_km=(300.0, 500.0))
+    scenario = scenario.replace(max_move_km=50.0, max_steps=25, arrival="declared", start_heading="random")
+    return scenario.with_tasks(scenario.random_tasks(12, 3))
 
 
 def test_a_model_and_a_start_beat_dead_reckoning() -> None:
-    scenario = earth_scenario(16, 3, max_move_km=90.0, max_latitude=70, distance_range_km=(300.0, 500.0))
-    scenario = scenario.replace(max_move_km=50.0, max_steps=40, arrival="declared", start_heading="random")
-    scenario = scenario.with_tasks(scenario.random_tasks(24, 3))
-    told = {"errors": "underwater", "model": "IGRF-13", "start_km": 5.0, "seed": 3}
-    share = {name: evaluate(name, scenario, **told)["success"].double().mean() for name in ("kalman", "dead_reckoning")}
-    assert share["kalman"] > share["dead_reckoning"] + 0.15
+    told = {"tasks": scenario_of(70), "errors": "underwater", "model": "IGRF-13", "start_km": 5.0, "seed": 3}
+    share = [evaluate(name, **told)["success"].double().mean() for name in ("kalman", "dead_reckoning")]
+    assert share[0] > share[1] + 0.15
 
 
 def test_a_chart_of_declination_corrects_a_compass() -> None:
-    scenario = earth_scenario(16, 3, max_latitude=60, distance_range_km=(300.0, 500.0)).replace(arrival="declared")
-    scenario = scenario.with_tasks(scenario.random_tasks(24, 3))
-    told = {"north": "magnetic", "start_km": 1.0, "max_steps": 40, "seed": 3}
-    with_chart = evaluate("dead_reckoning", scenario, model="IGRF-13", **told)["success"]
-    assert with_chart.all()
+    told, scenario = {"north": "magnetic", "start_km": 1.0, "seed": 3}, scenario_of(60)
+    assert evaluate("dead_reckoning", scenario, model="IGRF-13", **told)["success"].all()
     assert evaluate("dead_reckoning", scenario, **told)["success"].double().mean() < 0.5
 
 

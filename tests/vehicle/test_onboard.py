@@ -23,7 +23,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.episodes import restart
 from magrl.evaluation.navigators import fitted, make_navigator
 from magrl.field import IGRF, elements_at
-from magrl.geodesy import geodesic, move, move_place
+from magrl.geodesy import move, move_place
 from magrl.navigators import Anywhere, Navigator
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Rules, load_pilot, save_pilot
@@ -270,31 +270,6 @@ def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
     vehicle.start(TARGET, (60.4, 5.3), start_km=100.0, date="2026-06-30")
     assert vehicle.step(*at(58.5, 5.3), heading=0.0).reason == ""
     assert begun().step(*HERE, 290.0).reason == "the sign of D and the compass were not checked: give the start"
-
-
-# A known place
-
-
-def test_a_vehicle_that_knows_its_place_follows_it_in_a_current() -> None:
-    """The current is 3 % of the way; readings and places are of the model."""
-    place, there, current = torch.tensor([55.0, -20.0]).double(), (57.0, -15.0), torch.tensor([0.018, -0.024]).double()
-    vehicle, known = Onboard("kalman", sensor_std=NOISE), {"date": "2026-06-30", "model": "IGRF-14"}
-    vehicle.start(there, (50.0, -20.0), **known)
-    with pytest.raises(ValueError, match=r"the first reading, .* does not fit the start, .*: check .* place"):
-        vehicle.step(*at(*place.tolist()), heading=0.0)
-    vehicle.start(there, place, **known)
-    command = vehicle.step(*at(*place.tolist()), heading=0.0)
-    while command.stop is None:
-        course = math.radians(command.heading_deg)
-        way = command.distance_km * (current + torch.tensor([math.cos(course), math.sin(course)]))
-        place = move_place(place, torch.atan2(way[1], way[0]), way.norm())
-        command = vehicle.step(*at(*place.tolist()), command.heading_deg, command.distance_km)
-        distance, bearing = geodesic(*torch.tensor(command.place).double(), *place)
-        error = distance * torch.stack((bearing.cos(), bearing.sin()))
-        assert error @ torch.linalg.solve(torch.tensor(command.place_covariance_km2).double(), error) < 9
-    assert command.stop == "arrived"
-    assert geodesic(*place, *torch.tensor(there).double())[0] < 25
-    assert command.drift == pytest.approx(current.tolist(), abs=0.01)
 
 
 # Moves and messages
