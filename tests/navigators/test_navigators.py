@@ -1,4 +1,6 @@
-"""Navigators that need no training."""
+"""Navigators that need no training, and all on another device."""
+
+from __future__ import annotations
 
 import copy
 import itertools
@@ -7,6 +9,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from support.conformance import check_one_device
 from support.tracks import randn
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
@@ -18,7 +21,10 @@ from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
 from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant
 from magrl.navigators.base import displacement_to
+from magrl.navigators.metaheuristics import Metaheuristic
 from magrl.navigators.quasi_newton import probe_length
+from magrl.sensor_std import STD_KEYS
+from magrl.tracking import earth_model
 from magrl.transforms import Conditions, SensorErrors, with_conditions
 
 
@@ -278,3 +284,24 @@ def test_a_reading_that_is_nan_is_not_flown(env) -> None:
     action = navigator(state)["action"]
     assert action[3, 1].isnan()
     assert action[:3].isfinite().all()
+
+
+@pytest.mark.parametrize("name", sorted({*NAVIGATORS} - {"kalman"}))  # which is in anywhere
+def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch) -> None:
+    """In a decision, without the choice of rows in a batch, whose number depends on values."""
+    arrival = "declared" if name in ("anywhere", "dead_reckoning") else "objective"
+    env = GeomagneticNavEnv(num_envs=2, seed=0, arrival=arrival)
+    small = {"generations": 2, "population_size": 3} if issubclass(NAVIGATORS[name], Metaheuristic) else {}
+    navigator = NAVIGATORS[name].for_env(env, **small)
+    if name == "dead_reckoning":
+        navigator = navigator.fitted(env, {"model": earth_model("IGRF-13", "2022-01-01")})
+    seen = env.reset().update({key: torch.zeros(2, 3) for key in STD_KEYS})
+    seen = seen.select(*navigator.in_keys, *navigator.optional_keys, strict=False)
+
+    def decide(moved) -> None:
+        there = moved(seen)
+        step = there["elapsed_steps"].squeeze(-1)
+        memory = {"decided_at": step, "field_readings": step, "action": there["heading"]}
+        navigator.decide(there, TensorDict(memory | navigator.first_memory(there), 2))
+
+    check_one_device(monkeypatch, navigator, decide)

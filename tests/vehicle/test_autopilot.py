@@ -329,9 +329,7 @@ def test_the_north_of_a_compass_is_measured_and_a_refused_reading_does_not_turn_
     assert "not possible" in flight.note or "changed from" in flight.note
 
 
-def test_a_loop_is_refused_without_a_start_and_after_the_end(flown) -> None:
-    with pytest.raises(ValueError, match="call start"):
-        Loop(Onboard("secant"))
+def test_a_loop_is_refused_after_the_end(flown) -> None:
     flight = loop()
     flight.command = flown[1][-1]
     with pytest.raises(RuntimeError, match="has stopped: within 25 km"):

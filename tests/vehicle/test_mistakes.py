@@ -15,6 +15,7 @@ import torch
 
 from magrl.navigators import Geodesic
 from magrl.sensor_std import SensorStd
+from magrl.vehicle.autopilot import Loop
 from magrl.vehicle.autopilot.__main__ import main as autopilot
 from magrl.vehicle.logs import axes_of_elements, calibrate, read_log, read_readings
 from magrl.vehicle.logs.__main__ import main as logs
@@ -94,6 +95,7 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (Onboard, (), {"sensor_std": (0.02, 0.02, 0.002)}, r"sensor_std.noise: 0.002 nT .*: it looks like microtesla"),
     (Onboard, (), {"sensor_std": SensorStd(bias=(0.1, 0.1, 0.02))}, "sensor_std.bias: 0.02 nT .* give 0 for a perfect"),
     (Onboard, (), {"sensor_std": (1e5, 0.1, 1.0)}, "sensor_std.noise must be at most 10000, as in an outage"),
+    (lambda: Loop(Onboard("secant")), (), {}, "call start before it is steered"),
     (start, ((-11.6, 75.4),), {}, "target .* is a place, which needs a model of the Earth: give the date"),
     (start, ("x",), {}, "target"),
     (start, ((-11.6, 88.5, 1500.0),), {}, "the target: B_H 1500 nT is out of the range"),
