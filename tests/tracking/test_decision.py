@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magrl import tracking
 from magrl.sensor_std import SensorStd
-from magrl.tracking import ArrivalDecision, DestinationPosterior, Trip, approach, arrival_decision, decision
+from magrl.tracking import ArrivalDecision, DestinationPosterior, Trip, approach, arrival_decision
 from magrl.tracking.belief import STATES
 
 RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
@@ -96,14 +96,6 @@ def test_a_vehicle_near_the_border_goes_nearer_as_far_as_readings_there_help() -
     barely = near._replace(probability=near.worth)
     assert barely.declare.item()
     assert not barely._replace(worth=near.worth * 1.001).declare.item()
-
-
-def test_the_probability_of_the_radius_is_that_of_samples() -> None:
-    root = 20 * randn(6, 2, 2)
-    covariance, apart = root @ root.mT, f64((0.0, 0.0), (15.0, -5.0), (-30.0, 20.0))
-    error = (randn(20_000, 2, seed=1) @ root.mT).unsqueeze(-2)
-    expected = ((error + apart).norm(dim=-1) <= RADIUS_KM).double().mean(-2)
-    torch.testing.assert_close(decision._within(covariance, apart, RADIUS_KM), expected, rtol=0, atol=0.04)
 
 
 def test_the_approach_turns_where_it_is_if_the_way_is_behind() -> None:

@@ -210,6 +210,9 @@ def test_they_show_how_far_the_model_is_off() -> None:
 def test_they_count_by_their_accuracy(errors: dict) -> None:
     before, after = at_start(), told(at_start(), **errors)
     torch.testing.assert_close(after.field, before.field, rtol=1e-4, atol=1.0)
+    less = told(at_start(), **{name: 100 / 1e6 * value for name, value in errors.items()})
+    variances = [one.covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(-1) for one in (told(at_start()), less, before)]
+    assert (torch.stack(variances).diff(dim=0) > 0).all()
 
 
 def test_declination_counts_neither_by_a_compass_nor_where_it_is_missing() -> None:

@@ -171,17 +171,6 @@ def test_the_detour_by_hand() -> None:
     torch.testing.assert_close(planning._detour(way, across), f64(100.0, 300.0, 40.0))
 
 
-def test_the_moves_that_are_compared() -> None:
-    way = f64(0.0, 20.0)
-    moves = planning._moves(way, tracking.LENGTHS, 50.0)
-    assert moves.shape == ((len(tracking.LENGTHS) + 1) * len(planning.ANGLES_DEG), 2)
-    assert (moves - way).norm(dim=-1).min() < 1e-9  # the way itself
-    assert moves.norm(dim=-1).min() == pytest.approx(5.0)
-    assert moves.norm(dim=-1).max() == pytest.approx(50.0)
-    for far, shortest in ((20, 10.0), (500, 50.0)):  # 400 km, 10000 km
-        assert planning._moves(far * way, tracking.LENGTHS, 50.0).norm(dim=-1).min() == pytest.approx(shortest)
-
-
 def test_the_price_of_a_step_rises_as_steps_run_out() -> None:
     """Of 50 steps, 15 are for a way of 500 km; a poor reading keeps some in reserve, and a missing one none."""
 

@@ -116,7 +116,7 @@ def test_ardupilot_as_text(tmp_path: Path) -> None:
     assert log.source == "ArduPilot DataFlash, text: GPS, MAG, ATT"
 
 
-def telemetry(path: Path, kind: str, air: float, *, field: bool = True) -> Path:
+def telemetry(path: Path, kind: str, air: float) -> Path:
     """Telemetry of ArduPilot or PX4; positions without a fix do not count."""
     link, parts = MAVLink(None), []
     for row, (axes, angles) in enumerate(zip(AXES.tolist(), ATTITUDE.tolist(), strict=True)):
@@ -127,7 +127,7 @@ def telemetry(path: Path, kind: str, air: float, *, field: bool = True) -> Path:
         if kind == "PX4":
             imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in axes), 0, 0, 0, 0, 0, 1)
         fix = MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros)
-        messages = *[imu] * field, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
+        messages = imu, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
         stamp = struct.pack(">Q", int((UTC + row) * 1e6))
         parts += [stamp + message.pack(link) for message in messages]
     return written(path, b"".join(parts))
