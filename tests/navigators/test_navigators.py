@@ -1,7 +1,5 @@
 """Navigators that need no training, and all on another device."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math
