@@ -1,7 +1,5 @@
 """Rules of arrival in the environment: by distance, and declared by the third number of the action."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -16,17 +14,15 @@ def declared(num_envs: int = 2, radius_km: float = 25.0, **options: object) -> G
     return paper_env(num_envs, arrival="declared", radius_km=radius_km, **options)
 
 
-def test_actions_of_another_size_are_refused() -> None:
-    for env, size, message in (
-        (declared(), 2, "must be 3 numbers, distance, turn and declare, got 2: for a policy that does not declare"),
-        (paper_env(), 3, "must be 2 numbers, distance and turn, got 3$"),
+def test_actions() -> None:
+    """Of three numbers, where they declare."""
+    env = declared(3)
+    for wrong, size, message in (
+        (env, 2, "must be 3 numbers, distance, turn and declare, got 2: for a policy that does not declare"),
+        (paper_env(3), 3, "must be 2 numbers, distance and turn, got 3$"),
     ):
         with pytest.raises(ValueError, match=message):
-            env.step(env.reset().set("action", torch.zeros(2, size)))
-
-
-def test_specs() -> None:
-    env = declared(3)
+            wrong.step(wrong.reset().set("action", torch.zeros(3, size)))
     assert env.action_spec.shape == (3, 3)
     assert env.action_spec.space.low[0].tolist() == pytest.approx([0.0, -math.pi / 2, -1.0])
     assert env.action_spec.space.high[0].tolist() == pytest.approx([50.0, math.pi / 2, 1.0])
@@ -50,21 +46,15 @@ def test_a_declaration_within_the_radius_is_a_success_and_elsewhere_a_false_arri
 
 def test_the_objective_ends_no_episode() -> None:
     """A vehicle on its target goes on until it declares, by the step limit at the latest."""
-    env = near(20.0)
+    env = near(20.0, max_steps=3)
     stay, go = torch.tensor([[0.0, 0.0, -1.0]]), torch.tensor([[20.0, 0.0, -1.0]])
     state = step_mdp(env.step(env.reset().set("action", go)))
     assert state["objective"].item() < env.zeta
+    state = step_mdp(env.step(state.set("action", stay)))
     assert not state["done"].any()
-    for _ in range(48):
-        state = step_mdp(env.step(state.set("action", stay)))
-    assert not state["done"].any()
-    last = env.step(state.clone().set("action", stay))["next"]
-    assert last["truncated"].all()
-    assert not last["terminated"].any()
-    right = env.step(state.set("action", stay.abs()))["next"]
-    assert right["success"].all()
-    assert right["terminated"].all()
-    assert not right["truncated"].any()
+    for action, success in ((stay, False), (stay.abs(), True)):
+        last = env.step(state.clone().set("action", action))["next"]
+        assert [bool(last[key]) for key in ("success", "terminated", "truncated")] == [success, success, not success]
 
 
 def test_an_arrival_by_distance_ends_the_episode_within_the_radius() -> None:

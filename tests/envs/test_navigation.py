@@ -42,18 +42,18 @@ def returns(env: TransformedEnv, policy: Callable[[TensorDict], TensorDict]) -> 
 
 def test_no_episode_without_an_arrival_earns_as_much_as_the_worst_arrival() -> None:
     """Standing still, turning on the spot, and every constant action, beside arrivals after 25 random moves."""
-    grid = torch.cartesian_prod(torch.linspace(-1, 1, 9), torch.linspace(-1, 1, 17))
+    grid = torch.cartesian_prod(torch.linspace(-1, 1, 5), torch.linspace(-1, 1, 17))
     constant = navigation_env(4 * len(grid), seed=0)
     earned, lucky = returns(constant, lambda state: state.set("action", grid.repeat(4, 1)))
-    env = navigation_env(200, seed=1, scale_actions=False)
+    env = navigation_env(64, seed=1, scale_actions=False)
     home = Geodesic.for_env(env.base_env)
 
     def astray(state: TensorDict) -> TensorDict:
         return env.rand_action(state) if state["elapsed_steps"].max() < 25 else home(state)
 
     worst, arrived = returns(env, astray)
-    assert arrived.sum() > 100
-    assert (~lucky).sum() > 600
+    assert arrived.sum() > 30
+    assert (~lucky).sum() > 300
     assert earned[~lucky].max() < worst[arrived].min()
     torch.testing.assert_close(earned[grid[:, 0].repeat(4) == -1], torch.full((68,), -5.0))  # who stands still
 

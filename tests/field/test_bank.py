@@ -1,16 +1,16 @@
-"""A bank of regional expansions is each of its planets in its own box."""
-
-from __future__ import annotations
+"""A regional expansion is its model inside its box, and NaN outside; a bank is each of its planets in its own box."""
 
 import copy
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
-from support.field_checks import f64
+from support.field_checks import f64, relative_error
 from torch import Tensor
 
-from magrl.field import FieldBank, RegionalField, SphericalHarmonicField, igrf_coefficients, random_planets
+from magrl.field import IGRF, FieldBank, RegionalField, SphericalHarmonicField, igrf_coefficients, random_planets
+from magrl.geodesy import curvature_radii
 
 ROUNDING_NT = 1e-8
 TOLERANCE_NT = 1e-3
@@ -127,17 +127,6 @@ def test_a_bank_of_given_coefficients() -> None:
     bank = FieldBank(expansion, f64(0, 10).view(1, 2), f64(0, 20).view(1, 2))
     assert bank(f64(10.0), f64(15.0), torch.tensor([0])).tolist() == [[0.0, 3.5, 5.0]]
     assert bank.error_nt.isnan().all()
-    with pytest.raises(ValueError, match="must hold 1 boxes, as expansion, got 2"):
-        FieldBank(expansion, *boxes(f64(0, 10), f64(0, 10)))
-    with pytest.raises(ValueError, match=r"shape \(K, 3, n, n\) .* got \(1, 2, 2, 2\)"):
-        FieldBank(expansion[:, 1:], *boxes(f64(0), f64(0)))
-
-
-def test_an_index_out_of_range_raises(bank: FieldBank) -> None:
-    with pytest.raises(ValueError, match=r"index 6 is not in \[0, 6\)"):
-        bank(f64(0.0, 0.0), f64(175.0, 175.0), torch.tensor([0, 6]))
-    with pytest.raises(TypeError, match=r"index must be int64, got torch\.float32"):
-        bank.value_and_gradient(f64(0.0), f64(175.0), torch.tensor([0.0]))
 
 
 def test_an_error_above_the_tolerance_names_the_worst_box(planets: Tensor) -> None:
@@ -150,31 +139,106 @@ def test_an_error_above_the_tolerance_names_the_worst_box(planets: Tensor) -> No
         FieldBank.build(planets, torch.tensor([0, 2, 1]), latitude, longitude, degree=8, tolerance_nt=0.01)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"gauss": torch.zeros(4, 4, dtype=torch.complex64)}, r"gauss .*\(P, N \+ 1, N \+ 1\).* got \(4, 4\)"),
-        ({"planet_index": torch.tensor([0, -1])}, r"planet_index -1 is not in \[0, 3\)"),
-        ({"planet_index": torch.tensor([0])}, r"planet_index .*\(2,\).* got \(1,\)"),
-        ({"latitude": f64(0, 10, 10, -91).view(2, 2)}, r"latitudes \(10\.0, -91\.0\) of box 1 must rise"),
-        ({"longitude": f64(0, math.inf, 0, 9).view(2, 2)}, r"longitudes of box 0 .*\(0\.0, inf\)"),
-        ({"latitude": f64(0, 10).view(1, 2)}, r"\(1, 2\) and \(2, 2\)"),
-        ({"degree": 0}, "degree .* got 0"),
-        ({"tolerance_nt": 0.0}, "tolerance_nt .* got 0"),
-    ],
-)
-def test_bad_planets_and_boxes_raise(changes: dict, message: str, planets: Tensor) -> None:
+ONE = torch.zeros(1, 3, 2, 2)
+MISTAKES: dict[str, dict | Callable[[FieldBank], object]] = {
+    r"gauss .*\(P, N \+ 1, N \+ 1\).* got \(4, 4\)": {"gauss": torch.zeros(4, 4, dtype=torch.complex64)},
+    r"planet_index -1 is not in \[0, 3\)": {"planet_index": torch.tensor([0, -1])},
+    r"planet_index .*\(2,\).* got \(1,\)": {"planet_index": torch.tensor([0])},
+    r"latitudes \(10\.0, -91\.0\) of box 1 must rise": {"latitude": f64(0, 10, 10, -91).view(2, 2)},
+    r"longitudes of box 0 .*\(0\.0, inf\)": {"longitude": f64(0, math.inf, 0, 9).view(2, 2)},
+    r"\(1, 2\) and \(2, 2\)": {"latitude": f64(0, 10).view(1, 2)},
+    "degree .* got 0": {"degree": 0},
+    "tolerance_nt .* got 0": {"tolerance_nt": 0.0},
+    "must hold 1 boxes, as expansion, got 2": lambda _: FieldBank(ONE, *boxes(f64(0, 10), f64(0, 10))),
+    r"shape \(K, 3, n, n\) .* got \(1, 2, 2, 2\)": lambda _: FieldBank(ONE[:, 1:], *boxes(f64(0), f64(0))),
+    r"index 6 is not in \[0, 6\)": lambda bank: bank(f64(0.0), f64(175.0), torch.tensor([6])),
+    r"index must be int64, got torch\.float32": lambda bank: bank(f64(0.0), f64(175.0), torch.tensor([0.0])),
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_mistakes(message: str, planets: Tensor, bank: FieldBank) -> None:
     latitude, longitude = boxes(f64(0, 10), f64(0, 10))
     good = {"gauss": planets, "planet_index": torch.tensor([0, 0]), "latitude": latitude, "longitude": longitude}
+    bad = MISTAKES[message]
     with pytest.raises((TypeError, ValueError), match=message):
-        FieldBank.build(**good | changes)
+        FieldBank.build(**good | bad) if isinstance(bad, dict) else bad(bank)
 
 
-def test_grids_have_the_values_of_their_positions(planets: Tensor) -> None:
-    bank = FieldBank.build(planets, PLANET, *BOXES)
-    units = f64(-1.0, 0.3, 1.0), f64(0.9, -0.2, 1.0)
-    latitude, longitude = (torch.lerp(*ends.split(1, 1), (1 + x) / 2) for ends, x in zip(BOXES, units, strict=True))
-    grids = torch.stack(torch.broadcast_tensors(latitude.unsqueeze(2), longitude.unsqueeze(1) - 360), -1)
-    expected = bank.value_and_gradient(grids[..., 0], grids[..., 1], torch.arange(len(bank)).reshape(-1, 1, 1))
-    for found, exact in zip(bank.on_grids(grids), expected, strict=True):
-        torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+# --- One region
+
+BOX = (-15.5, 5.5), (154.5, 175.5)
+
+
+@pytest.fixture(scope="module")
+def igrf() -> IGRF:
+    return IGRF("2022-01-01", generation=13)
+
+
+@pytest.fixture(scope="module")
+def region(igrf) -> RegionalField:
+    return RegionalField(igrf, *BOX)
+
+
+def test_region_is_the_model_inside(igrf, region):
+    unit = torch.rand(2, 2000, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    unit[:, :4] = f64(0, 0, 1, 1, 0, 1, 0, 1).reshape(2, 4)  # the corners
+    position = tuple(low + (high - low) * u for (low, high), u in zip(BOX, unit, strict=True))
+    expected, expected_gradient = igrf.value_and_gradient(*position)
+    value, gradient = region.value_and_gradient(*position)
+    assert region.error_nt < 1e-5
+    assert (value - expected).abs().max() < 1e-5
+    assert torch.equal(region(*position), value)
+    assert relative_error(gradient, expected_gradient) < 1e-6
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_outside_is_nan(region, dtype):
+    """One position inside; seven outside or NaN."""
+    latitude = torch.tensor([-5.0, -15.5001, 5.5001, -5.0, -5.0, -5.0, 80.0, math.nan], dtype=dtype)
+    longitude = torch.tensor([165.0, 165.0, 165.0, 154.4999, 175.5001, -15.0, 0.0, 165.0], dtype=dtype)
+    for found in (region(latitude, longitude), *region.value_and_gradient(latitude, longitude)):
+        assert found[0].isfinite().all()
+        assert found[1:].isnan().all()
+
+
+@pytest.mark.parametrize("model", ["igrf", "region"])
+def test_shapes_and_dtypes_of_models(model, request):
+    field = request.getfixturevalue(model)
+    for dtype in (torch.float32, torch.float64):
+        latitude, longitude = torch.tensor([[-8.0], [-5.0], [-2.0]], dtype=dtype), torch.tensor([160.0, 165.0])
+        value, gradient = field.value_and_gradient(latitude, longitude)
+        assert field(latitude, longitude).shape == (3, 2, 3)
+        assert value.dtype == gradient.dtype == torch.float64
+        one = field.value_and_gradient(f64(-5.0)[0], f64(165.0)[0])
+        torch.testing.assert_close(value[1, 1], one[0], rtol=0, atol=ROUNDING_NT)
+        torch.testing.assert_close(gradient[1, 1], one[1], rtol=0, atol=ROUNDING_NT)
+    assert field(latitude[:0], longitude).shape == (0, 2, 3)
+
+
+@pytest.mark.parametrize("model", ["igrf", "region"])
+def test_models_are_compiled_whole_and_can_be_differentiated(model, request):
+    """Their own gradient, northward per km, is what autograd finds per degree."""
+    field = request.getfixturevalue(model)
+    latitude, longitude = f64(-8.0, -2.0).requires_grad_(), f64(164.0, 162.0)
+    (slope,) = torch.autograd.grad(field(latitude, longitude).sum(), latitude)
+    latitude = latitude.detach()
+    meridian, _ = curvature_radii(latitude)
+    expected = field.value_and_gradient(latitude, longitude)[1][..., 0].sum(-1) * torch.deg2rad(meridian)
+    torch.testing.assert_close(slope, expected, rtol=1e-9, atol=0)
+    whole = torch.compile(field.forward, fullgraph=True, backend="eager")
+    torch.testing.assert_close(whole(latitude, longitude), field(latitude, longitude), rtol=0, atol=ROUNDING_NT)
+
+
+@pytest.mark.parametrize(("degree", "tolerance_nt"), [(4, 1e-3), (12, 1e-13)])
+def test_an_error_above_the_tolerance_raises(igrf, degree, tolerance_nt):
+    message = rf"degree {degree} misses the field by \d[\d.e+-]* nT .*\(-10, 0\).*\(160, 170\).*{tolerance_nt:.3g} nT"
+    with pytest.raises(ValueError, match=message):
+        RegionalField(igrf, (-10, 0), (160, 170), degree=degree, tolerance_nt=tolerance_nt)
+
+
+def test_a_region_survives_a_state_dict(region):
+    twin = RegionalField(IGRF(1950.0), *BOX)
+    twin.load_state_dict(region.state_dict())
+    assert torch.equal(twin(f64(-8.0), f64(164.0)), region(f64(-8.0), f64(164.0)))
+    assert not list(region.parameters())

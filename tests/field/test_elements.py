@@ -14,26 +14,11 @@ from magrl.field.elements import (
     measured_elements,
 )
 
-SHAPES = ((), (3,), (2, 3), (0,))
-DTYPES = (torch.float32, torch.float64)
-
 
 def random_fields(*shape, seed=0):
     """Field vectors of the Earth's size in every direction."""
     generator = torch.Generator().manual_seed(seed)
     return 3e4 * torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
-
-
-@pytest.mark.parametrize(("north", "declination_north"), [(1, 0), (-1, 180)])
-@pytest.mark.parametrize("east", [1, -1])
-@pytest.mark.parametrize("down", [1, -1])
-def test_signs_in_every_octant(north, declination_north, east, down):
-    """3, 4, 12: B_H is 5; the angle from the north-south line is atan(4/3), the dip atan(12/5)."""
-    found = measured_elements(f64(3.0 * north, 4.0 * east, 12.0 * down))
-    from_axis = math.degrees(math.atan2(4, 3))
-    declination = east * (from_axis if declination_north == 0 else 180 - from_axis)
-    inclination = down * math.degrees(math.atan2(12, 5))
-    torch.testing.assert_close(found, f64(declination, inclination, 5.0), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -44,12 +29,13 @@ def test_signs_in_every_octant(north, declination_north, east, down):
         ((-1.0, 0.0, 0.0), 180.0, 0.0),
         ((-1.0, -0.0, 0.0), 180.0, 0.0),
         ((0.0, -1.0, 0.0), -90.0, 0.0),
-        ((1.0, 0.0, -1.0), 0.0, -45.0),
+        ((3.0, -4.0, 12.0), -math.degrees(math.atan2(4, 3)), math.degrees(math.atan2(12, 5))),
+        ((-3.0, 4.0, -12.0), 180 - math.degrees(math.atan2(4, 3)), -math.degrees(math.atan2(12, 5))),
         ((-0.0, -0.0, 5e4), 0.0, 90.0),
         ((0.0, -0.0, -5e4), 0.0, -90.0),
     ],
 )
-def test_angles_on_the_axes(b_ned, declination, inclination):
+def test_angles_by_hand(b_ned, declination, inclination):
     """D is in (-180, 180]: due south is +180, however its zero is signed; at a magnetic pole it is 0."""
     assert measured_elements(f64(*b_ned))[:2].tolist() == pytest.approx([declination, inclination], abs=1e-13)
 
@@ -71,10 +57,9 @@ def test_round_trip():
     torch.testing.assert_close(field_vector(measured_elements(b_ned)), b_ned, rtol=1e-10, atol=1e-7)
 
 
-@pytest.mark.parametrize("differentiate", [torch.func.jacrev, torch.func.jacfwd])
-def test_jacobian_matches_autograd(differentiate):
+def test_jacobian_matches_autograd():
     b_ned = random_fields(200, seed=2)
-    expected = torch.func.vmap(differentiate(measured_elements))(b_ned)
+    expected = torch.func.vmap(torch.func.jacrev(measured_elements))(b_ned)
     row = expected.abs().amax(-1, keepdim=True)
     assert ((elements_jacobian(b_ned) - expected).abs() / row).max() < 1e-12
 

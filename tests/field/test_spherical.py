@@ -1,17 +1,136 @@
-"""Fields of spherical harmonics: a dipole by hand, published values, derivatives, poles and altitudes."""
+"""Spherical harmonics against SciPy and autograd; their fields against published values; random planets."""
 
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.special
 import torch
 from support.field_checks import central_differences, f64, globe, relative_error
+from torch import Tensor
 
+from magrl.field import igrf_coefficients, random_planets
 from magrl.field.elements import measured_elements
+from magrl.field.harmonics import (
+    basis,
+    chebyshev,
+    chebyshev_nodes,
+    contract,
+    field_table,
+    gradient_table,
+    products,
+    separate,
+    waves,
+)
 from magrl.field.igrf import IGRF
+from magrl.field.planets import power_spectrum
 from magrl.field.spherical import SphericalHarmonicField
-from magrl.geodesy import REFERENCE_RADIUS_KM, WGS84_A_KM, WGS84_B_KM
+from magrl.geodesy import REFERENCE_RADIUS_KM
+
+
+def random_table(degree, seed):
+    """A table ``g - i h`` with nothing above its diagonal and no sine of order 0."""
+    generator = torch.Generator().manual_seed(seed)
+    table = torch.randn(degree + 1, degree + 1, generator=generator, dtype=torch.complex128).tril()
+    table[:, 0] = table[:, 0].real.to(torch.complex128)
+    return table
+
+
+def random_points(count, seed, radius=(0.9, 1.3)):
+    """``(count, 3)`` km in random directions, at radii in units of the reference radius."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    low, high = radius
+    length = low + (high - low) * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    return direction * length * REFERENCE_RADIUS_KM
+
+
+def potential(table, ecef_km):
+    """V / a [nT], term by term, with none of the library's layout but the order of the basis."""
+    rows = iter(basis(ecef_km, len(table) - 1))
+    total = 0
+    for n in range(len(table)):
+        for m in range(n + 1):
+            total = total + table[n, m].real * next(rows) - table[n, m].imag * next(rows)
+    return total
+
+
+# --- basis ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 1, 15])
+def test_basis_is_the_schmidt_normalized_legendre_functions(degree):
+    ecef = random_points(50, 3)
+    x, y, z = ecef.T.numpy() / REFERENCE_RADIUS_KM
+    radius, longitude = (x**2 + y**2 + z**2) ** 0.5, torch.atan2(*ecef[:, [1, 0]].T).numpy()
+    rows = []
+    for n in range(degree + 1):
+        for m in range(n + 1):
+            norm = math.sqrt((2 if m else 1) * math.factorial(n - m) / math.factorial(n + m))
+            legendre = (-1) ** m * scipy.special.lpmv(m, n, z / radius)  # SciPy has the Condon-Shortley phase
+            term = torch.from_numpy(norm * legendre / radius ** (n + 1))
+            rows += [term * torch.from_numpy(m * longitude).cos(), term * torch.from_numpy(m * longitude).sin()]
+    found = basis(ecef, degree)
+    assert found.shape == ((degree + 1) * (degree + 2), 50)
+    torch.testing.assert_close(found, torch.stack(rows), rtol=1e-11, atol=1e-13)
+
+
+# --- field and gradient -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 1, 6])
+def test_field_is_minus_the_gradient_of_the_potential(degree):
+    table, ecef = random_table(degree, 5), random_points(20, 6).requires_grad_()
+    (slope,) = torch.autograd.grad((REFERENCE_RADIUS_KM * potential(table, ecef)).sum(), ecef)
+    found = (field_table(table) @ basis(ecef.detach(), degree + 1)).T
+    torch.testing.assert_close(found, -slope, rtol=1e-10, atol=1e-10 * float(slope.abs().max()))
+
+
+@pytest.mark.parametrize("degree", [1, 6])
+def test_gradient_is_the_derivative_of_the_field(degree):
+    """And has no trace, since there are no sources, and is symmetric, since there is no curl."""
+    table, ecef = random_table(degree, 7), random_points(10, 8)
+    weights = field_table(table)
+    jacobian = torch.stack(
+        [torch.autograd.functional.jacobian(lambda p: (weights @ basis(p[None], degree + 1))[:, 0], p) for p in ecef]
+    )
+    found = (gradient_table(table) @ basis(ecef, degree + 2)).T.unflatten(-1, (3, 3))
+    torch.testing.assert_close(found, jacobian, rtol=1e-10, atol=1e-10 * float(jacobian.abs().max()))
+    batch = torch.stack((table, 2 * table))
+    torch.testing.assert_close(gradient_table(batch)[1], 2 * gradient_table(table), rtol=0, atol=0)
+    torch.testing.assert_close(field_table(batch)[1], 2 * weights, rtol=0, atol=0)
+
+
+# --- separated synthesis ----------------------------------------------------------------------------------------------
+
+
+def separated(weights, degree, ecef_km):
+    x, y, z = ecef_km.unbind(-1)
+    axis = torch.hypot(x, y)
+    features, lift = products(axis, z, degree)
+    return contract(separate(weights, degree), features, waves(x / axis, y / axis, lift, degree))
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 15, 40])
+def test_separated_weights_give_what_the_basis_gives(degree):
+    generator = torch.Generator().manual_seed(12)
+    weights = torch.randn(4, (degree + 1) * (degree + 2), generator=generator, dtype=torch.float64)
+    ecef = random_points(50, 13, radius=(0.98, 1.5))
+    torch.testing.assert_close(
+        separated(weights, degree, ecef), weights @ basis(ecef, degree), rtol=0, atol=1e-12 * degree**2
+    )
+
+
+@pytest.mark.parametrize("count", [2, 3, 8, 27])
+def test_chebyshev_polynomials_and_their_coefficients(count):
+    x = torch.linspace(-1, 1, 11, dtype=torch.float64)
+    expected = torch.stack([torch.cos(k * torch.acos(x)) for k in range(count)])
+    torch.testing.assert_close(chebyshev(x, count), expected, rtol=0, atol=1e-13)
+    angles, to_coefficients = chebyshev_nodes(count)
+    identity = to_coefficients @ chebyshev(angles.cos(), count).T
+    torch.testing.assert_close(identity, torch.eye(count, dtype=torch.float64), rtol=0, atol=1e-14)
+
 
 ROUNDING_NT = 1e-8
 DATA = Path(__file__).parent.parent / "data"
@@ -24,15 +143,6 @@ def igrf() -> IGRF:
 
 def assert_same(found, expected):
     torch.testing.assert_close(found, expected, rtol=0, atol=ROUNDING_NT)
-
-
-def test_axial_dipole_worked_by_hand():
-    """g10 = -30000 nT: northward on the equator; twice as strong at the poles, down at the north, up at the south."""
-    gauss = torch.zeros(2, 2, dtype=torch.complex128)
-    gauss[1, 0] = -30000.0
-    found = SphericalHarmonicField(gauss)(f64(0.0, 90.0, -90.0), f64(50.0, 0.0, 0.0))
-    equator, pole = 30000 * (REFERENCE_RADIUS_KM / WGS84_A_KM) ** 3, 60000 * (REFERENCE_RADIUS_KM / WGS84_B_KM) ** 3
-    assert_same(found, f64(equator, 0, 0, 0, 0, pole, 0, 0, -pole).reshape(3, 3))
 
 
 def wmm2025(year):
@@ -94,32 +204,96 @@ def test_altitudes_broadcast_and_chunks_do_not_show(igrf, monkeypatch):
     assert_same(found[0][2], igrf(latitude, longitude, 600.0))
 
 
-@pytest.mark.parametrize(
-    ("latitude", "longitude", "altitude_km", "message"),
-    [
-        (90.1, 0.0, 0.0, "latitude 90.1"),
-        (math.nan, 0.0, 0.0, "latitude nan"),
-        (0.0, math.inf, 0.0, "longitude inf"),
-        (0.0, 0.0, math.nan, "altitude_km nan is not"),
-        (0.0, 0.0, math.inf, "altitude_km inf is not"),
-    ],
-)
-def test_positions_off_the_earth_raise(latitude, longitude, altitude_km, message):
-    model = SphericalHarmonicField(torch.zeros(2, 2, dtype=torch.complex128))
-    for function in (model, model.value_and_gradient):
-        with pytest.raises(ValueError, match=message):
-            function(f64(0.0, latitude), f64(0.0, longitude), f64(0.0, altitude_km))
+ZERO = torch.zeros(2, 2, dtype=torch.complex128)
+MISTAKES = {
+    "latitude 90.1": (90.1, 0.0, 0.0),
+    "latitude nan": (math.nan, 0.0, 0.0),
+    "longitude inf": (0.0, math.inf, 0.0),
+    "altitude_km nan is not": (0.0, 0.0, math.nan),
+    "altitude_km inf is not": (0.0, 0.0, math.inf),
+    "altitude_km -101.0 is not a finite number from -100 km on": {"altitude_km": -101.0},
+    "gauss must be a tensor of complex numbers": {"gauss": torch.zeros(2, 2)},
+    r"gauss must have the shape .*, got \(2, 3\)": {"gauss": torch.zeros(2, 3, dtype=torch.complex64)},
+    "gauss holds non-finite": {"gauss": torch.full((2, 2), complex(0, math.nan))},
+}
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"altitude_km": -101.0}, "altitude_km -101.0 is not a finite number from -100 km on"),
-        ({"gauss": torch.zeros(2, 2)}, "gauss must be a tensor of complex numbers"),
-        ({"gauss": torch.zeros(2, 3, dtype=torch.complex64)}, r"gauss must have the shape .*, got \(2, 3\)"),
-        ({"gauss": torch.full((2, 2), complex(0, math.nan))}, "gauss holds non-finite"),
-    ],
-)
-def test_bad_tables_and_options_raise(options, message):
+@pytest.mark.parametrize("message", MISTAKES)
+def test_positions_off_the_earth_and_bad_tables_raise(message):
+    def call(bad):
+        field = SphericalHarmonicField(**{"gauss": ZERO} | (bad if isinstance(bad, dict) else {}))
+        return field.value_and_gradient(*(f64(0.0, x) for x in bad))
+
     with pytest.raises((TypeError, ValueError), match=message):
-        SphericalHarmonicField(**{"gauss": torch.zeros(2, 2, dtype=torch.complex128)} | options)
+        call(MISTAKES[message])
+
+
+EARTH = igrf_coefficients("2022-01-01", 13)
+COUNT = 4000
+
+
+@pytest.fixture(scope="module")
+def planets() -> Tensor:
+    return random_planets(COUNT, seed=0)
+
+
+def dipoles(planets: Tensor) -> Tensor:
+    """Dipole moments as vectors x, y, z, ``(count, 3)`` [nT]."""
+    return torch.stack((planets[:, 1, 1].real, -planets[:, 1, 1].imag, planets[:, 1, 0].real), -1)
+
+
+def coefficients(planets: Tensor, n: int) -> Tensor:
+    """The 2n + 1 coefficients g and h of a degree, ``(count, 2n + 1)``."""
+    return torch.cat((planets[:, n, : n + 1].real, planets[:, n, 1 : n + 1].imag), -1)
+
+
+def test_the_spectrum_is_the_earth_s(planets: Tensor) -> None:
+    """The mean factors are 1 + 0.6²/12 for the dipole and 1.25 for each other degree."""
+    ratio = power_spectrum(planets)[:, 1:] / power_spectrum(EARTH)[1:]
+    expected = torch.tensor([1 + 0.6**2 / 12] + [1.25] * 12, dtype=torch.float64)
+    standard_error = ratio.std(0) / math.sqrt(COUNT)
+    assert ((ratio.mean(0) - expected).abs() < 4 * standard_error).all()
+    assert (standard_error < 0.02).all()
+
+
+def test_the_power_of_a_degree_varies_by_planet_and_degree(planets: Tensor) -> None:
+    """At a high degree, the factor of 0.5 to 2 is most of the variance of the power: 0.1875 + 2 (1.75) / (2n + 1)."""
+    ratio = power_spectrum(planets)[:, 1:] / power_spectrum(EARTH)[1:]
+    for n in (2, 7, 13):
+        assert ratio[:, n - 1].var().item() == pytest.approx(0.1875 + 3.5 / (2 * n + 1), rel=0.12), n
+    assert torch.corrcoef(ratio[:, 10:].T).fill_diagonal_(0).abs().max() < 0.08
+
+
+def test_dipoles_are_tilted_and_have_the_earth_s_polarity(planets: Tensor) -> None:
+    moment = dipoles(planets)
+    strength = moment.norm(dim=-1) / dipoles(EARTH.unsqueeze(0)).norm()
+    tilt = torch.rad2deg(torch.acos(-moment[:, 2] / moment.norm(dim=-1)))
+    side = torch.rad2deg(torch.atan2(moment[:, 1], moment[:, 0]))
+    for values, low, high in ((strength, 0.7, 1.3), (tilt, 0.0, 40.0), (side, -180.0, 180.0)):
+        assert ((values >= low) & (values <= high)).all()
+        quartiles = torch.quantile((values - low) / (high - low), torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64))
+        assert quartiles.tolist() == pytest.approx([0.25, 0.5, 0.75], abs=0.03)
+    assert (EARTH[1, 0].real < 0) & (planets[:, 1, 0].real < 0).all()
+
+
+def test_a_seed_gives_the_same_planets_and_another_gives_others() -> None:
+    state = torch.get_rng_state()
+    first = random_planets(5, seed=7)
+    assert torch.equal(first, random_planets(5, seed=7))
+    assert torch.equal(state, torch.get_rng_state())
+    other = random_planets(5, seed=8)
+    below = torch.ones(14, 14).tril().bool()
+    below[0] = False
+    assert (first != other)[:, below].all()
+    assert (first[:-1] != first[1:])[:, below].all()
+
+
+def test_the_spectrum_continues_above_degree_13() -> None:
+    power = power_spectrum(random_planets(COUNT, seed=4, degree=20)).mean(0) / 1.25
+    n = torch.arange(2.0, 14, dtype=torch.float64)
+    known = torch.log(power_spectrum(EARTH)[2:])
+    slope = float(((n - n.mean()) * known).sum() / (n - n.mean()).square().sum())
+    expected = [math.exp(float(known.mean()) + slope * (k - 7.5)) for k in range(14, 21)]
+    assert power[14:].tolist() == pytest.approx(expected, rel=0.05)
+    assert power[2:14].tolist() == pytest.approx(power_spectrum(EARTH)[2:].tolist(), rel=0.06)
+    assert -1.5 < slope < -0.9  # the Earth's core: about a factor of 3 a degree

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import save
 from tensordict import TensorDict
@@ -86,7 +86,6 @@ def same(one: object, other: object) -> bool:
     return repr(one) == repr(other)  # NaN too
 
 
-@settings(max_examples=25)
 @given(CONTENT)
 def test_content_is_read_as_it_was_written(tmp_path_factory, content: object) -> None:
     path = tmp_path_factory.getbasetemp() / "content.safetensors"

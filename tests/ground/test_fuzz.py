@@ -19,7 +19,7 @@ from magrl.training.config import resumed_config
 from magrl.transforms import ReadingView, load_conditions
 from magrl.vehicle.logs import Calibration, read_log
 
-MUTANTS = 200
+MUTANTS = 80
 CALIBRATION = '{{"matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "offset_nt": [0, 0, {}], "method": "vector", '
 CALIBRATION += '"std": [0, 0, 0], "noise_nt": 1, "samples": 9, "outliers": 0, "here": [1, 2]}}'
 
@@ -114,7 +114,6 @@ def test_scenarios(tmp_path: Path, suffix: str) -> None:
     fuzz(path, lambda: load_scenario(path), lambda found: isinstance(found, Scenario), 3)
 
 
-HUGE, LARGE = f"1{'0' * 400}", "1e20"
 NUMBERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "conditions.toml": (load_conditions, "speed_km_h = {}"),
     "conditions.json": (load_conditions, '{{"sensors": {{"noise": [0, 0, {}]}}}}'),
@@ -133,21 +132,21 @@ NUMBERS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-@pytest.mark.parametrize("number", [HUGE, LARGE, f"-{HUGE}"])
-def test_numbers_whose_squares_are_infinite_are_refused(name: str, number: str, tmp_path: Path) -> None:
+def test_numbers_whose_squares_are_infinite_are_refused(name: str, tmp_path: Path) -> None:
     """An infinite bias would mean a compass."""
     (read, text), path = NUMBERS[name], tmp_path / name
-    path.write_text(text.format(number), encoding="utf-8")
-    with pytest.raises(ValueError, match=f"^(cannot read )?{path}"):
-        read(path)
+    for number in (f"1{'0' * 400}", "1e20", f"-1{'0' * 400}"):
+        path.write_text(text.format(number), encoding="utf-8")
+        with pytest.raises(ValueError, match=f"^(cannot read )?{path}"):
+            read(path)
 
 
-@pytest.mark.parametrize("key", ["in_keys", "out_keys", "seed"])
-def test_conditions_of_a_file_have_no_keys(key: str, tmp_path: Path) -> None:
+def test_conditions_of_a_file_have_no_keys(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
-    path.write_text(f'sensors.{key} = ["field"]', encoding="utf-8")
-    with pytest.raises(ValueError, match=f"^{path}: unknown key '{key}'"):
-        load_conditions(path)
+    for key in ("in_keys", "out_keys", "seed"):
+        path.write_text(f'sensors.{key} = ["field"]', encoding="utf-8")
+        with pytest.raises(ValueError, match=f"^{path}: unknown key '{key}'"):
+            load_conditions(path)
 
 
 CSV = b"time,mag_x_uT,mag_y_uT,mag_z_uT,roll,heading_true_rad,speed_kn,lat,lon,alt_m\n"
@@ -162,13 +161,12 @@ def test_logs(tmp_path: Path, content: bytes) -> None:
     fuzz(path, lambda: read_log(path), lambda found: len(found.samples) > 0 and bool(found.source), 4)
 
 
-@pytest.mark.parametrize("cells", [(60000, 60000), (0,), ("a",), (), (1,) * 200_000, ((4,),)])
-def test_policy_that_asks_for_more_than_it_holds(tmp_path: Path, cells: tuple) -> None:
+def test_policy_that_asks_for_more_than_it_holds(tmp_path: Path) -> None:
     path = tmp_path / "policy.pt"
     save_policy(path, small_policy())
     content = load_tensors(path)
-    content["config"]["num_cells"] = cells
-    save_tensors(content, path)
-    with pytest.raises(ValueError, match="does not hold a valid policy") as error:
-        load_policy(path)
-    assert str(path) in str(error.value)
+    for cells in ((60000, 60000), (0,), ("a",), (), (1,) * 200_000, ((4,),)):
+        content["config"]["num_cells"] = cells
+        save_tensors(content, path)
+        with pytest.raises(ValueError, match=f"{path}.* does not hold a valid policy"):
+            load_policy(path)

@@ -107,16 +107,8 @@ def heading_of(error, gradient, offset=0.0):
 def test_approach_is_the_direction_of_the_inverse_in_any_axes_and_units():
     """In all quadrants, and on the axes themselves; it depends on the difference alone."""
     gradient, error = approaches(500, 2)
-    error[:8] = (
-        gradient[:8]
-        @ torch.stack(
-            [
-                f64(0, 30, 90, 135, 180, -150, -90, -45).deg2rad().cos(),
-                f64(0, 30, 90, 135, 180, -150, -90, -45).deg2rad().sin(),
-            ],
-            -1,
-        ).unsqueeze(-1)
-    ).squeeze(-1)
+    angle = f64(0, 30, 90, 135, 180, -150, -90, -45).deg2rad()
+    error[:8] = (gradient[:8] @ torch.stack((angle.cos(), angle.sin()), -1).unsqueeze(-1)).squeeze(-1)
     solved = torch.linalg.solve(gradient, error)
     heading = heading_of(error, gradient)
     assert wrap_angle(heading - torch.atan2(solved[:, 1], solved[:, 0])).abs().max() < 1e-12

@@ -1,7 +1,5 @@
 """No-go areas."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
@@ -20,7 +18,9 @@ from magrl.transforms.areas import NUMBER, distance_km, outlines, turned
 
 def flown(**options: object) -> TensorDict:
     env = no_go_env(64, observation="dict", scale_actions=False, seed=3, **options)
-    return env.rollout(20, make_navigator("geodesic", env.base_env), break_when_any_done=False)["next"]
+    return env.rollout(
+        options.get("max_steps", 12), make_navigator("geodesic", env.base_env), break_when_any_done=False
+    )["next"]
 
 
 def test_a_leg_that_meets_an_area_ends_the_episode_without_success() -> None:
@@ -47,10 +47,9 @@ def test_areas_are_seen_only_from_nearby() -> None:
     torch.testing.assert_close(seen, expected)
 
 
-@pytest.mark.parametrize("steps", [3, 5])
-def test_an_episode_that_meets_an_area_in_its_last_step_is_not_truncated(steps: int) -> None:
-    after = flown(max_steps=steps)
-    assert (after["terminated"] & (after["elapsed_steps"] == steps)).any()
+def test_an_episode_that_meets_an_area_in_its_last_step_is_not_truncated() -> None:
+    after = flown(max_steps=3)
+    assert (after["terminated"] & (after["elapsed_steps"] == 3)).any()
     assert not (after["terminated"] & after["truncated"]).any()
     assert (after["done"] == after["terminated"] | after["truncated"]).all()
 
@@ -64,10 +63,10 @@ def test_distance_is_that_from_a_leg_between_its_ends() -> None:
 def test_every_observation_has_the_areas(observation: str, size: int) -> None:
     """As its last numbers, within the bounds of the space."""
     name = "magrl/GeomagneticNavigationNoGo-v0"
-    envs = gymnasium.make_vec(name, num_envs=32, observation=observation, autoreset_mode="SameStep")
+    envs = gymnasium.make_vec(name, num_envs=16, observation=observation, autoreset_mode="SameStep")
     envs.reset(seed=0)
-    for _ in range(3):
-        found, *_ = envs.step(np.tile(np.float32([[1, 0]]), (32, 1)))
+    for _ in range(2):
+        found, *_ = envs.step(np.tile(np.float32([[1, 0]]), (16, 1)))
     areas = found["areas"] if observation == "dict" else found[:, size:]
     space = envs.single_observation_space
     space = space["areas"] if observation == "dict" else space
@@ -92,11 +91,10 @@ def test_areas_join_the_observation_alone() -> None:
     assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
 
 
-@pytest.mark.parametrize("options", [{"reward": "paper"}, {"reward": "base"}])
-def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused(options: dict) -> None:
-    with pytest.raises(ValueError, match="reward"):
-        no_go_env(**options)
-    assert no_go_env(reward="spl", seed=0).reset()["observation"].shape == (1, 22)
+def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused() -> None:
+    for reward in ("paper", "base"):
+        with pytest.raises(ValueError, match="reward"):
+            no_go_env(reward=reward)
 
 
 def test_no_area_covers_a_start_or_a_destination() -> None:

@@ -1,27 +1,34 @@
-"""The true way and the reward for a short path: by hand, over whole episodes, and as transforms."""
-
-from __future__ import annotations
+"""Rewards and what they need: the true way, short paths, the gradient of the field, and alignment with it."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
-from support.errors import nav
+from support.errors import field, nav
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, Transform, TransformedEnv
 
+from magrl.envs import GeomagneticNavEnv, planet_scenario
 from magrl.evaluation import episode_measures
+from magrl.field.elements import elements_gradient
+from magrl.field.model import elements_at
 from magrl.geodesy import geodesic, move
 from magrl.navigators import Secant
-from magrl.transforms import DistanceCost, HighestSPL, ProgressReward, RandomStepPrice, SPLReward, TrueWay
+from magrl.transforms import (
+    AlignmentReward,
+    DistanceCost,
+    FieldGradient,
+    GradientHeading,
+    HighestSPL,
+    ProgressReward,
+    RandomStepPrice,
+    SPLReward,
+    TrueWay,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
-
-
-def rewarded(num_envs: int = 2, **options: object) -> TransformedEnv:
-    return TransformedEnv(
-        nav(num_envs, **options), Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())
-    )
 
 
 # The way
@@ -65,30 +72,22 @@ def test_highest_spl_by_hand() -> None:
     torch.testing.assert_close(step["reward"], 10 * (step["highest_spl"] - 1) - 0.05)
 
 
-def test_return_of_progress_depends_on_both_ends_alone() -> None:
-    """Whatever the way between them: kilometers nearer over 50, 10 at the arrival, 0.1 for each step."""
-    env = TransformedEnv(nav(64, max_steps=10), Compose(TrueWay(), ProgressReward()))
-    rollout = env.rollout(10, Secant(), break_when_any_done=False, break_when_all_done=True)
-    measures = episode_measures(rollout)
-    within = torch.arange(rollout.shape[1]) < measures["steps"].unsqueeze(-1)
-    returns = (rollout["next", "reward"].squeeze(-1) * within).sum(-1).double()
-    nearer_km = measures["shortest_km"] - measures["navigation_error_km"]
-    torch.testing.assert_close(
-        returns, nearer_km / 50 + 10 * measures["success"] - 0.1 * measures["steps"], rtol=0, atol=1e-4
+def test_returns_depend_on_both_ends_alone() -> None:
+    """Progress: kilometers nearer over 50, 10 at the arrival, 0.1 for each step; else SPL less the price of steps."""
+    rollouts = []
+    for rewards in ((TrueWay(), ProgressReward()), (RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())):
+        env = TransformedEnv(nav(64, max_steps=10), Compose(*rewards))
+        rollouts.append(env.rollout(10, Secant(), break_when_any_done=False, break_when_all_done=True))
+    measures = episode_measures(rollouts[0])
+    within = torch.arange(rollouts[0].shape[1]) < measures["steps"].unsqueeze(-1)
+    nearer_km, price = measures["shortest_km"] - measures["navigation_error_km"], rollouts[1]["step_price"][:, 0, 0]
+    expected = (
+        nearer_km / 50 + 10 * measures["success"] - 0.1 * measures["steps"],
+        10 * (measures["spl"] - 1) - 0.1 * price * measures["steps"],
     )
-    assert 10 < measures["success"].sum() < 60
-
-
-def test_return_of_an_episode_is_its_spl_less_its_steps() -> None:
-    env = rewarded(64, max_steps=10)
-    rollout = env.rollout(10, Secant(), break_when_any_done=False, break_when_all_done=True)
-    measures = episode_measures(rollout)
-    within = torch.arange(rollout.shape[1]) < measures["steps"].unsqueeze(-1)
-    returns = (rollout["next", "reward"].squeeze(-1) * within).sum(-1)
-    price = rollout["step_price"][:, 0, 0]
-    torch.testing.assert_close(
-        returns.double(), 10 * (measures["spl"] - 1) - 0.1 * price * measures["steps"], rtol=0, atol=5e-3
-    )
+    for rollout, returns in zip(rollouts, expected, strict=True):
+        found = (rollout["next", "reward"].squeeze(-1) * within).sum(-1).double()
+        torch.testing.assert_close(found, returns, rtol=0, atol=5e-3)
     assert 10 < measures["success"].sum() < 60
 
 
@@ -104,21 +103,144 @@ def test_prices_are_log_uniform_and_stay_for_an_episode() -> None:
 
 def test_what_is_missing_is_named() -> None:
     """Without the state before the move there is no reward, and that of the environment must not pass for it."""
-    td = rewarded().rollout(2)[:, 0]
+    td = TransformedEnv(nav(), Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())).rollout(1)
     with pytest.raises(KeyError, match=r"SPLReward reads its state .*highest_spl"):
         SPLReward()(td.exclude("highest_spl"))
     with pytest.raises(KeyError, match=r"HighestSPL reads .*success"):
         HighestSPL()(td.exclude(("next", "success")))
 
 
-def long_move(td: TensorDict) -> TensorDict:
-    return td.set("action", torch.tensor([30.0, 0.1]).expand(*td.shape, 2))
-
-
 def test_distance_cost_is_paid_for_each_kilometer() -> None:
     env = TransformedEnv(nav(4), DistanceCost(0.05))
-    costly = env.rollout(5, long_move)
+    action = torch.tensor([30.0, 0.1]).expand(4, 2)
+    costly = env.rollout(2, lambda td: td.set("action", action))
     reward, move = costly["next", "reward"], costly["next", "move"]
     terms = costly["next", "reward_destination"] + costly["next", "reward_proximity"]
     torch.testing.assert_close(reward, terms - 0.05 * move[..., :1])
     assert (move[..., 0] == 30).all()
+
+
+def test_field_gradient_is_the_slope_between_neighbors() -> None:
+    """Central differences over 2 km northward and eastward, on the ellipsoid."""
+    env = TransformedEnv(nav(6), FieldGradient(field()))
+    td = env.rollout(3)["next"]
+    latitude, longitude = td["position"].unbind(-1)
+    slopes = []
+    for heading in (0.0, math.pi / 2):
+        ends = [
+            torch.stack(move(latitude, longitude, torch.full_like(latitude, h), torch.ones_like(latitude)), -1)
+            for h in (heading, heading + math.pi)
+        ]
+        slopes.append((elements_at(field(), ends[0]) - elements_at(field(), ends[1])) / 2)
+    torch.testing.assert_close(td["field_gradient"].double(), torch.stack(slopes, -1), rtol=1e-4, atol=1e-6)
+
+
+def test_field_gradient_of_a_bank_is_that_of_each_region() -> None:
+    base = GeomagneticNavEnv(planet_scenario(4, seed=0), num_envs=12, seed=0)
+    guided = Compose(FieldGradient(base.field), GradientHeading(pair="auto"), AlignmentReward())
+    td = TransformedEnv(base, guided).rollout(3)["next"]
+    assert len(td["region"].unique()) > 2
+    place = td["position"].unbind(-1)
+    for number in range(4):
+        here = td["region"].squeeze(-1) == number
+        index = torch.full_like(td["region"].squeeze(-1), number)
+        gradient = elements_gradient(*base.field.value_and_gradient(*place, index)).float()
+        assert torch.equal(td["field_gradient"][here], gradient[here])
+
+
+def heading_of(
+    here: list[float], there: list[float], gradient: list[list[float]], **options: object
+) -> tuple[float, bool]:
+    """The heading in degrees and the mask, for one place."""
+    names = ("field", "target_field", "field_gradient")
+    td = TensorDict(
+        {n: torch.tensor(x, dtype=torch.float64) for n, x in zip(names, (here, there, gradient), strict=True)}
+    )
+    out = GradientHeading(**options)(td)
+    return math.degrees(out["gradient_heading"]), bool(out["gradient_heading_valid"])
+
+
+@pytest.mark.parametrize(
+    ("gradient", "pair"),
+    [
+        ([[0.0, 0.01], [0.02, 0.0], [-1.0, 1.0]], ("D", "I")),
+        ([[0.0, 0.01], [-0.001, 0.02], [-1.0, 0.1]], ("D", "B_H")),
+        ([[0.0, 0.0], [0.02, 0.0], [-1.0, 1.0]], ("I", "B_H")),
+    ],
+)
+def test_automatic_pair_is_the_one_that_crosses_best(gradient: list, pair: tuple[str, str]) -> None:
+    here, there = [179.5, -16.0, 35000.0], [-180.0, -14.0, 35200.0]
+    heading, valid = heading_of(here, there, gradient, pair="auto")
+    assert valid
+    assert heading == heading_of(here, there, gradient, pair=pair)[0]
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "degrees"), [(179.0, -179.0, 90.0), (-179.5, 179.5, -90.0), (-1.0, 1.0, 90.0)]
+)
+def test_declination_is_taken_the_short_way(here: float, there: float, degrees: float) -> None:
+    gradient = [[0.0, 0.01], [0.02, 0.0]]
+    heading, valid = heading_of([here, 0.0], [there, 0.0], gradient)
+    assert valid
+    assert heading == pytest.approx(degrees, abs=1e-9)
+
+
+def test_no_direction_is_masked() -> None:
+    assert heading_of([0.0, 0.0], [0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]], pair=(0, 1)) == (0.0, False)
+
+
+def transition(**changes: object) -> TensorDict:
+    """One step whose angles are all different, so that reading a wrong one gives another number."""
+    entries = {"angle": 1.3, "reference": 0.1, "trusted": True}
+    after = {"angle": 0.4, "reference": -0.8, "trusted": False, "reward": 7.0}
+    after = {name: torch.tensor([value]) for name, value in after.items()}
+    td = TensorDict({name: torch.tensor([value]) for name, value in entries.items()} | {"next": TensorDict(after)})
+    return td.update(changes)
+
+
+def test_masked_reference_earns_nothing_even_if_it_is_nan() -> None:
+    td = transition(trusted=torch.tensor([False]), reference=torch.tensor([float("nan")]))
+    assert float(AlignmentReward(["angle", "reference", "trusted"])(td)["next", "reward"]) == 7.0
+
+
+def test_reward_is_created_when_missing() -> None:
+    out = AlignmentReward(["angle", "reference"], "alignment")(transition())
+    assert float(out["next", "reward"]) == 7.0
+    assert float(out["next", "alignment"]) == pytest.approx(3 * (math.pi / 4 - 0.3), abs=1e-5)
+    assert "alignment" not in out
+
+
+def test_in_the_env_the_second_out_key_is_what_the_first_one_gained() -> None:
+    alignment = AlignmentReward(out_keys=["reward", "reward_alignment"])
+    env = TransformedEnv(nav(4), Compose(FieldGradient(field()), GradientHeading(), alignment))
+    td = env.rollout(5)["next"]
+    base = td["reward_destination"] + td["reward_proximity"]
+    assert td["reward_alignment"].std() > 0.5
+    torch.testing.assert_close(td["reward"] - base, td["reward_alignment"], rtol=0, atol=1e-4)
+    assert env.reward_key == "reward"
+    assert isinstance(env.observation_spec["reward_alignment"], Unbounded)
+    assert (env.reset()["reward_alignment"] == 0).all()
+
+
+def guided(transform: Transform) -> TransformedEnv:
+    return TransformedEnv(nav(), Compose(FieldGradient(field()), transform))
+
+
+MISTAKES: dict[str, Callable[[], object]] = {
+    "AlignmentReward needs transitions, with 'next'": lambda: AlignmentReward(["angle", "reference"])(
+        transition().exclude("next")
+    ),
+    "value_and_gradient.*str": lambda: FieldGradient("IGRF"),
+    "region for a bank of fields": lambda: FieldGradient(field(), ["position", "region"]),
+    "'Z'.*D, I, B_H": lambda: GradientHeading(pair=("D", "Z")),
+    r"got \(2, 3\)": lambda: guided(FieldGradient(field(), ["field"])).specs,
+    r"values \(E,\), got \(\)": lambda: guided(FieldGradient(lambda position: position.sum(-1))).specs,
+    r"\(2, 3\), \(2, 2\)": lambda: guided(GradientHeading(["field", "move", "field_gradient"])).specs,
+    r"\[0, 3\].*\(2, 3\)": lambda: guided(GradientHeading(pair=(0, 3))).specs,
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_mistakes_of_guidance(message: str) -> None:
+    with pytest.raises((ValueError, KeyError), match=message):
+        MISTAKES[message]()

@@ -1,7 +1,5 @@
 """The observation of policies with a memory of their own: by hand on a field with constant gradients."""
 
-from __future__ import annotations
-
 import math
 
 import torch

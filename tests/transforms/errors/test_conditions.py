@@ -1,7 +1,5 @@
 """Conditions of real vehicles: presets, what navigators are told, what they may read, and the commands."""
 
-from __future__ import annotations
-
 import copy
 import math
 from pathlib import Path
@@ -13,7 +11,6 @@ import torch
 import tyro
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import EnvBase
 
 from magrl import Anywhere, Kalman
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
@@ -21,6 +18,7 @@ from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
+from magrl.navigators import Secant
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
 from magrl.transforms import (
     CONDITIONS,
@@ -41,16 +39,6 @@ ERRORS = [name for name in CONDITIONS if name != "laboratory"]
 
 def nav(num_envs: int, drift_km: float = 0.0, **options: object) -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=num_envs, seed=0, start_heading="random", drift_km=drift_km, **options)
-
-
-def under(name: str, num_envs: int = 2, seed: int = 0) -> EnvBase:
-    return with_conditions(nav(num_envs, CONDITIONS[name].drift_km(50.0)), name, seed)
-
-
-def test_an_error_of_the_compass_in_motion_alone_flies() -> None:
-    compass = Conditions("compass", motion={"compass_deg": 5.0})
-    env = with_conditions(nav(2, compass.drift_km(50.0)), compass, seed=0)
-    assert env.rollout(2)["next", "true_move"].shape[-1] == 2
 
 
 def test_order_of_the_errors() -> None:
@@ -74,7 +62,7 @@ class TypicalField(nn.Module):
 def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
     """At the latitude at which a dipole has the typical inclination; the weather of a ship over its way of 500 km."""
     region = Scenario(region=Region((39, 43), (160, 170)))
-    env = with_conditions(nav(4000, CONDITIONS[name].drift_km(50.0), scenario=region), name)
+    env = with_conditions(nav(1000, CONDITIONS[name].drift_km(50.0), scenario=region), name)
     env.base_env.field = TypicalField()
     state = env.reset()
     if name == "ship":
@@ -95,7 +83,9 @@ EVERY_ERROR = Conditions(
 )
 
 
-@pytest.mark.parametrize("conditions", [*(CONDITIONS[name] for name in ERRORS), EVERY_ERROR], ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    "conditions", [CONDITIONS["low-cost"], CONDITIONS["ship"], EVERY_ERROR], ids=lambda one: one.name
+)
 def test_what_is_told_follows_from_the_reading(conditions: Conditions) -> None:
     """If it depended on the true field, a policy could compute that field from it.
 
@@ -138,7 +128,7 @@ def test_evaluations_repeat_and_seeds_differ() -> None:
     rollouts = []
     for seed in (0, 0, 1):
         env = with_conditions(nav(3, CONDITIONS["low-cost"].drift_km(50.0), max_steps=3), "low-cost", seed)
-        rollouts += [evaluation_rollout(env, Kalman(max_steps=3)) for _ in range(2)]
+        rollouts += [evaluation_rollout(env, Secant()) for _ in range(2 - seed)]
     assert all((rollout == rollouts[0]).all() for rollout in rollouts[1:4])
     assert not torch.equal(rollouts[0]["field"], rollouts[4]["field"])
 
@@ -184,22 +174,17 @@ BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.
 
 def test_own_errors_in_a_file() -> None:
     """The errors of the example are those written in Python, and both commands take its path."""
-    boat = Conditions(
-        "survey boat",
-        15.0,
-        sensors={
-            "noise": (0.02, 0.02, 5.0),
-            "vector": VectorErrors(hard_iron_nt=(20.0, 20.0, 20.0), attitude_deg=(0.05, 0.05)),
-        },
-        north={"constant_deg": 0.2, "random_deg": 0.1},
-        motion={"log_scale": 0.02, "current_km_h": 1.0},
-        weather={"record": "disturbed"},
-    )
-    read = load_conditions(BOAT)
-    for errors in (read, str(BOAT)):
-        flown = [with_conditions(nav(2, 8.0), each, 3).rollout(4, Kalman()) for each in (errors, boat)]
-        torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
-    assert (read.name, read.std) == (boat.name, boat.std)
+    vector = VectorErrors(hard_iron_nt=(20.0, 20.0, 20.0), attitude_deg=(0.05, 0.05))
+    options = {
+        "sensors": {"noise": (0.02, 0.02, 5.0), "vector": vector},
+        "north": {"constant_deg": 0.2, "random_deg": 0.1},
+        "motion": {"log_scale": 0.02, "current_km_h": 1.0},
+        "weather": {"record": "disturbed"},
+    }
+    boat = Conditions("survey boat", 15.0, **options)
+    assert (load_conditions(BOAT).name, load_conditions(BOAT).std) == (boat.name, boat.std)
+    flown = [with_conditions(nav(2, 8.0), each, 3).rollout(2, Secant()) for each in (str(BOAT), boat)]
+    torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
         assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).errors == str(BOAT)
         noise = tyro.cli(recipe.Config, args=[*places, "--errors", "0.05", "0.05", "5"]).errors
@@ -238,13 +223,13 @@ def test_fly_under_conditions(tmp_path: Path) -> None:
 def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> None:
     """It goes the same way whatever the reading is, within a percent of what the reading is worth otherwise."""
     noise = (0.05, 0.05, 5.0)
-    env = with_conditions(GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"noise": noise}), seed=0)
+    env = with_conditions(nav(10), Conditions("noise", sensors={"noise": noise}), seed=0)
     navigator = make_navigator(name, env.base_env, sensor_std=noise)
     state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
 
     def turns(std: float, shift: float) -> torch.Tensor:
         """Turns [rad] after a reading with ``std`` times the noise that is shifted by ``shift`` times the noise."""
-        field, told = state["field"] + shift * torch.tensor(noise), (std * torch.tensor(noise)).expand(20, 3)
+        field, told = state["field"] + shift * torch.tensor(noise), (std * torch.tensor(noise)).expand(10, 3)
         return copy.deepcopy(navigator)(state.clone().update({"field": field, "sensor_std": told}))["action"][:, 1]
 
     heeded, ignored = ((turns(std, 5.0) - turns(std, 0.0)).abs().mean() for std in (1.0, OUTAGE_STD))

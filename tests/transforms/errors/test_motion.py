@@ -1,18 +1,24 @@
-"""Errors of motion: a track by numpy, statistics, eddies, and the farthest move."""
+"""Errors of motion and of the north reference: by hand and by their statistics; magnetic north."""
 
-from __future__ import annotations
-
+import itertools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from support.errors import actions, flown, motion_error, nav
+from support.errors import STD, actions, flown, motion_error, nav, sensor_errors
+from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 
-from magrl.geodesy import move
-from magrl.transforms import MotionError
+from magrl import GeomagneticNavEnv
+from magrl.envs import Scenario
+from magrl.evaluation import Flight, evaluate
+from magrl.geodesy import geodesic, move
+from magrl.sensor_std import SensorStd
+from magrl.transforms import NORTH_REFERENCES, MagneticNorth, MotionError, NorthReferenceError, north_reference
+from magrl.transforms.errors.base import true_keys
 from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
 
 F64 = torch.float64
@@ -83,3 +89,141 @@ def test_the_environment_must_allow_the_farthest_move() -> None:
         with pytest.raises(ValueError, match=message):
             _ = TransformedEnv(nav(drift_km=drift_km), errors()).specs
     assert TransformedEnv(nav(drift_km=7.01), errors()).action_spec.space.high[0, 0] == 50
+
+
+NOISE = (0.02, 0.02, 2.0)
+
+
+# The north reference
+
+
+def test_an_error_of_two_degrees_turns_the_heading_and_the_declination() -> None:
+    """And the vehicle goes where it went without, as a turn is relative; it believes to go 2 degrees less."""
+    plain = flown(nav(3), actions(4, 3))
+    states = flown(TransformedEnv(nav(3), NorthReferenceError(2.0, fixed=True)), actions(4, 3))
+    for true, state in zip(plain, states, strict=True):
+        assert torch.equal(state["true_heading"], true["heading"])
+        assert torch.equal(state["position"], true["position"])
+        assert torch.equal(state["true_field"], true["field"])
+        believed = torch.remainder(true["heading"] - math.radians(2) - state["heading"] + 1, 2 * math.pi) - 1
+        torch.testing.assert_close(believed, torch.zeros(3, 1), atol=1e-5, rtol=0)
+        torch.testing.assert_close(state["field"] - true["field"], torch.tensor([[-2.0, 0.0, 0.0]]).expand(3, 3))
+        assert state["bias_std"].tolist() == [[2.0, 0.0, 0.0]] * 3
+        assert state["sensor_std"].eq(0).all()
+
+
+def test_declination_is_wrapped() -> None:
+    state = TensorDict(
+        heading=torch.tensor([[-3.12]]), field=torch.tensor([[-179.0, 0.0, 1.0]]), move=torch.zeros(1, 2)
+    )
+    after = NorthReferenceError(3.0, fixed=True)._reset(TensorDict(batch_size=[1]), state.auto_batch_size_(1))
+    torch.testing.assert_close(after["field"][0, 0], torch.tensor(178.0))
+    torch.testing.assert_close(after["heading"][0, 0], torch.tensor(2 * math.pi - 3.12 - math.radians(3)))
+
+
+def test_error_grows_with_the_secant_of_the_latitude() -> None:
+    keys = ("heading", "field", "move", "position")
+    error = NorthReferenceError(0.5, fixed=True, in_keys=keys)
+    for state in flown(TransformedEnv(nav(3), error), actions(3, 3)):
+        latitude = state["position"][:, 0].deg2rad()
+        torch.testing.assert_close(state["north_error"][:, 2].double(), 0.5 / latitude.cos(), atol=1e-6, rtol=0)
+
+
+def test_parts_of_the_error_have_their_sizes() -> None:
+    env = TransformedEnv(nav(4000), NorthReferenceError(0.5, 0.3, 0.2, drift_length_km=20.0))
+    states = flown(env, torch.tensor([[[20.0, 0.1]]]).expand(2, 4000, -1))
+    parts = torch.stack([state["north_error"] for state in states])
+    white = parts[..., 2] - parts[..., 0] - parts[..., 1]
+    assert torch.equal(parts[0, :, 0], parts[2, :, 0])
+    sizes = torch.stack((parts[..., 0].std(1), parts[..., 1].std(1), white.std(1)), -1)
+    torch.testing.assert_close(sizes, torch.tensor([[0.5, 0.3, 0.2]]).expand(3, 3), rtol=0.05, atol=0)
+    assert torch.corrcoef(parts[:, :, 1])[0, 2].item() == pytest.approx(math.exp(-2), abs=0.05)
+    assert torch.corrcoef(white).triu(1).abs().max() < 0.06
+
+
+@pytest.mark.parametrize("name", NORTH_REFERENCES)
+def test_references_on_the_market(name: str) -> None:
+    """The total of the standards' limits, read as two standard deviations; tan(latitude) is tan(I) / 2 of a dipole."""
+    error = north_reference(name, speed_km_h=20.0)
+    total = {"fiber-optic": 0.1, "marine": math.hypot(0.375, 0.125, 0.25), "low-cost": math.hypot(0.5, 0.75)}
+    state = TransformedEnv(nav(), error).reset()
+    secant = 1 / torch.cos(torch.atan(torch.tan(torch.deg2rad(state["field"][0, 1])) / 2))
+    growth = 1 if name == "low-cost" else secant.item()
+    assert math.hypot(state["sensor_std"][0, 0], state["bias_std"][0, 0]) == pytest.approx(growth * total[name])
+    assert state["drift_std"][0, 0].item() == pytest.approx(growth * (0.125 if name == "marine" else 0))
+    assert ("position" in error.in_keys) == (name != "low-cost")
+
+
+# Magnetic north
+
+
+def test_a_move_starts_at_the_heading_from_magnetic_north() -> None:
+    """And the next heading is that which was chosen: it does not tell how D changed along the move."""
+    states = flown(TransformedEnv(nav(3), MagneticNorth()), actions(4, 3))
+    for before, state in itertools.pairwise(states):
+        chosen = before["heading"] + state["move"][:, 1:]
+        around = torch.remainder(state["heading"] - chosen + 1, 2 * math.pi) - 1
+        torch.testing.assert_close(around, torch.zeros(3, 1), atol=1e-5, rtol=0)
+        course = geodesic(*before["position"].unbind(-1), *state["position"].unbind(-1))[1]
+        true = chosen.squeeze(-1) + torch.deg2rad(before["true_field"][:, 0])
+        around = torch.remainder(course - true + 1, 2 * math.pi) - 1
+        torch.testing.assert_close(around, torch.zeros(3).double(), atol=1e-4, rtol=0)
+        turned = state["true_heading"] - state["heading"] - torch.deg2rad(state["true_field"][:, :1])
+        torch.testing.assert_close(torch.remainder(turned + 1, 2 * math.pi) - 1, torch.zeros(3, 1), atol=1e-5, rtol=0)
+    plain = flown(nav(3), actions(4, 3))
+    assert torch.equal(states[0]["position"], plain[0]["position"])
+    for key in ("field", "target_field"):
+        assert states[-1][key][:, 0].eq(0).all()
+        assert torch.equal(states[0][key][:, 1:], plain[0][key][:, 1:])
+    torch.testing.assert_close(states[0]["objective"], plain[0]["objective"])  # that of the true elements
+    assert states[-1]["bias_std"].tolist() == [[math.inf, 0.0, 0.0]] * 3
+
+
+def test_nothing_public_depends_on_declination() -> None:
+    """In a field whose D is larger by 30 degrees, a vehicle with the same heading from magnetic north sees the same."""
+
+    def turned(degrees: float) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+        turn = torch.tensor(math.radians(degrees), dtype=torch.float64)
+
+        def field(latitude: torch.Tensor, longitude: torch.Tensor) -> torch.Tensor:
+            north, east = 20000 + 10 * latitude, 100 * longitude.sin()
+            x, y = north * turn.cos() - east * turn.sin(), north * turn.sin() + east * turn.cos()
+            return torch.stack((x, y, 30000 + 100 * latitude), -1)
+
+        return field
+
+    still = torch.zeros(2, 3, 2)
+    public = []
+    for degrees in (0.0, 30.0):
+        base = GeomagneticNavEnv(Scenario(field=turned(degrees)), num_envs=3, seed=0)
+        states = flown(TransformedEnv(base, MagneticNorth()), still)
+        privileged = {*true_keys(), "objective", "objective_weights", "reward_proximity"}
+        public.append(states[-1].exclude(*privileged))
+    heading = public[0]["heading"] - public[1]["heading"] - math.radians(30)
+    torch.testing.assert_close(heading, torch.zeros(3, 1), atol=1e-5, rtol=0)  # both started northward
+    for key in set(public[0].keys()) - {"heading", "reward", "episode_stream"}:
+        torch.testing.assert_close(public[0][key], public[1][key], atol=2e-3, rtol=1e-6, msg=key)
+
+
+def test_the_compass_shows_the_measured_field() -> None:
+    """Iron turns the compass: the vehicle believes to be on another heading than it is."""
+    env = TransformedEnv(nav(2), Compose(sensor_errors(), MagneticNorth()))
+    state = env.reset()
+    torch.testing.assert_close(state["true_heading"], torch.zeros(2, 1), atol=1e-6, rtol=0)
+    compass = -torch.rad2deg(state["heading"]).squeeze(-1)
+    assert (compass - state["true_field"][:, 0]).abs().min() > 1e-3
+
+
+@pytest.mark.parametrize(("navigator", "noise"), [("kalman", NOISE), ("secant", NOISE), ("anywhere", (0.0,) * 3)])
+def test_navigators_fly_by_the_compass(navigator: str, noise: tuple[float, float, float]) -> None:
+    scenario = Scenario(arrival="distance", start_heading="random", max_steps=60)
+    scenario = scenario.with_tasks(scenario.random_tasks(8, 1))
+    assert evaluate(navigator, scenario, errors=noise, north="magnetic")["success"].double().mean() > 0.7
+
+
+def test_only_the_bias_of_declination_may_be_unlimited() -> None:
+    assert SensorStd.of(SensorStd(STD, (math.inf, 0.0, 0.0))).magnetic
+    with pytest.raises(ValueError, match=r"sensor_std.bias must be 3 finite numbers"):
+        SensorStd.of(SensorStd(STD, (math.inf, math.inf, 0.0)))
+    with pytest.raises(ValueError, match="north must be"):
+        Flight(Scenario(), north="geographic")
