@@ -5,7 +5,7 @@ import hashlib
 import math
 from datetime import date as calendar_date
 from datetime import datetime, timedelta, timezone
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -89,27 +89,26 @@ def test_dates_from_first_to_last_day_of_the_model(generation):
             IGRF(date, generation)
 
 
-@pytest.mark.parametrize(
-    "date", [math.nan, -1.0, 0.5, 1e5, "yesterday", "2022-13-01", True, None, [], np.datetime64("NaT"), pandas.NaT]
-)
-def test_bad_dates_raise(date):
-    with pytest.raises(ValueError, match="date"):
-        IGRF(date)
+BAD_DATES = (math.nan, -1.0, 0.5, 1e5, "yesterday", "2022-13-01", True, None, [], np.datetime64("NaT"), pandas.NaT)
+MISTAKES = [
+    *((partial(IGRF, date), "date") for date in BAD_DATES),
+    *(
+        (partial(WMMHR, date), "is outside WMMHR-2025, .* to 2030-01-01")
+        for date in ("2024-12-31", "2030-01-02", 2024.9)
+    ),
+    *((partial(IGRF, 2020.0, bad), rf"generation {bad!r} is not available.*13, 14") for bad in (12, 15, "14")),
+    *(
+        (call, rf"altitude_km {km} is not from -15 to 1000 km .* in meters\?")
+        for km in (1001.0, -16.0)
+        for call in (partial(IGRF, 2020.0, altitude_km=km), partial(IGRF(2020.0), f64(0.0), f64(0.0), km))
+    ),
+]
 
 
-@pytest.mark.parametrize("altitude_km", [1001.0, -16.0])
-def test_an_altitude_in_meters_is_questioned(altitude_km):
-    message = rf"altitude_km {altitude_km} is not from -15 to 1000 km .* in meters\?"
+@pytest.mark.parametrize(("call", "message"), MISTAKES)
+def test_mistakes(call, message):
     with pytest.raises(ValueError, match=message):
-        IGRF(2020.0, altitude_km=altitude_km)
-    with pytest.raises(ValueError, match=message):
-        IGRF(2020.0)(*globe(2, 0), altitude_km)
-
-
-@pytest.mark.parametrize("generation", [12, 15, "14"])
-def test_other_generations_raise(generation):
-    with pytest.raises(ValueError, match=rf"generation {generation!r} is not available.*13, 14"):
-        IGRF(PAPER_DATE, generation)
+        call()
 
 
 # --- WMMHR-2025
@@ -142,12 +141,6 @@ def test_wmmhr_gives_its_published_values() -> None:
     assert table.shape == (16, 10)
     assert (found - table[:, 4:7]).abs().max() < 1e-3
     assert ((late - early) / 4.5 - table[:, 7:]).abs().max() < 1e-5
-
-
-@pytest.mark.parametrize("date", ["2024-12-31", "2030-01-02", 2024.9])
-def test_dates_outside_the_model_raise(date) -> None:
-    with pytest.raises(ValueError, match="is outside WMMHR-2025, which is valid from 2025-01-01 to 2030-01-01"):
-        WMMHR(date)
 
 
 def test_expansions_of_wmmhr() -> None:

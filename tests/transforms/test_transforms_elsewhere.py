@@ -33,12 +33,10 @@ def test_the_way_by_two_tracers_leads_to_the_target() -> None:
 
 
 def test_the_plume_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = {"seeds": 2, "total_frames": 128, "num_envs": 16, "init_random_frames": 32, "batch_size": 16}
-    trainings = plume.main(plume.Config(out=tmp_path, eval_every=4, eval_tasks=16, max_steps=5, **small))
-    assert {name: [run.frames for run in runs] for name, runs in trainings.items()} == {
-        "gg_td3": [[64, 128]] * 2,
-        "td3": [[64, 128]] * 2,
-    }
+    small = {"seeds": 2, "total_frames": 64, "num_envs": 16, "init_random_frames": 32, "batch_size": 16}
+    trainings = plume.main(plume.Config(out=tmp_path, eval_every=4, eval_tasks=8, max_steps=5, **small))
+    frames = {name: [run.frames for run in runs] for name, runs in trainings.items()}
+    assert frames == {"gg_td3": [[64]] * 2, "td3": [[64]] * 2}
     assert "| TD3 | 2 | 2 of 2 never |" in capsys.readouterr().out
     assert (tmp_path / "plume.png").read_bytes().startswith(b"\x89PNG")
 
