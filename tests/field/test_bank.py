@@ -77,6 +77,15 @@ def test_each_expansion_is_its_planet_at_any_turn(bank: FieldBank, planets: Tens
         assert (gradient[here] - expected[1]).abs().max() < 1e-5 * expected[1].abs().max(), box
 
 
+def test_grids_have_the_values_of_their_positions(bank: FieldBank) -> None:
+    units = f64(-1.0, 0.3, 1.0), f64(0.9, -0.2, 1.0)
+    latitude, longitude = (torch.lerp(*ends.split(1, 1), (1 + x) / 2) for ends, x in zip(BOXES, units, strict=True))
+    grids = torch.stack(torch.broadcast_tensors(latitude.unsqueeze(2), longitude.unsqueeze(1) - 360), -1)
+    expected = bank.value_and_gradient(grids[..., 0], grids[..., 1], torch.arange(len(bank)).reshape(-1, 1, 1))
+    for found, exact in zip(bank.on_grids(grids), expected, strict=True):
+        torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+
+
 def test_a_box_on_a_pole_and_a_whole_turn(planets: Tensor) -> None:
     edges = f64(80, 90, 0, 5).view(2, 2), f64(-20, 20, -180, 180).view(2, 2)
     bank = FieldBank.build(planets, torch.tensor([1, 2]), *edges, degree=60)

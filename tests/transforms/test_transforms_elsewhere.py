@@ -9,39 +9,7 @@ import pytest
 import torch
 
 sys.path.append(str(Path(__file__).parent.parent.parent / "docs" / "examples"))
-
-
-plume, plume_env, pendulum, classic_control = map(
-    importlib.import_module, ("plume", "plume_env", "pendulum", "classic_control")
-)
-
-
-# The estuary
-
-
-def test_the_way_by_two_tracers_leads_to_the_target() -> None:
-    """An oracle that holds the theoretical heading arrives: so the transforms speak the language of this env too."""
-    env = TransformedEnv(plume_env.PlumeEnv(60), Compose(StepCounter(30), *plume.guidance()))
-
-    def hold(td: TensorDictBase) -> TensorDictBase:
-        turn = wrap_angle(td["way"] - td["heading"]).clamp(-math.pi / 2, math.pi / 2)
-        return td.set("action", torch.cat((torch.full_like(turn, 0.6), turn), -1))
-
-    flown = env.rollout(30, hold, break_when_any_done=False, break_when_all_done=True)
-    assert flown["next", "terminated"].any(1).double().mean() > 0.95
-    assert flown["way_valid"].double().mean() > 0.95
-
-
-def test_the_plume_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = {"seeds": 2, "total_frames": 64, "num_envs": 16, "init_random_frames": 32, "batch_size": 16}
-    trainings = plume.main(plume.Config(out=tmp_path, eval_every=4, eval_tasks=8, max_steps=5, **small))
-    frames = {name: [run.frames for run in runs] for name, runs in trainings.items()}
-    assert frames == {"gg_td3": [[64]] * 2, "td3": [[64]] * 2}
-    assert "| TD3 | 2 | 2 of 2 never |" in capsys.readouterr().out
-    assert (tmp_path / "plume.png").read_bytes().startswith(b"\x89PNG")
-
-
-# Pendulum and classic control
+pendulum, classic_control = map(importlib.import_module, ("pendulum", "classic_control"))
 
 
 def test_the_pendulum_example() -> None:
