@@ -83,6 +83,7 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
     "rewarded": (nav, rewarded),
     "every error": (nav, every_error),
+    "compass": (nav, lambda: Compose(sensor_errors(), MagneticNorth())),
     "declared": (partial(nav, arrival="declared"), declared),
     "scaled pendulum": (PendulumEnv, pendulum),
 }
