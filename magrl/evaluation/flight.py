@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict
@@ -65,9 +65,6 @@ class Flight:
         tensor(True)
     """
 
-    env_class: ClassVar[type[GeomagneticNavEnv]] = GeomagneticNavEnv
-    """Class of the environment without errors."""
-
     def __init__(
         self,
         scenario: Scenario,
@@ -101,7 +98,7 @@ class Flight:
             way_km = max(500.0, scenario.distance_range_km[1])
             errors = replace(errors, weather={"way_km": way_km, **errors.weather})
         drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
-        self.base = self.env_class(scenario, **drift | options)
+        self.base = GeomagneticNavEnv(scenario, **drift | options)
         self.env = with_conditions(self.base, errors, seed)
         self.sensor_std = errors.std
         if model is not None:

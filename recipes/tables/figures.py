@@ -1,10 +1,10 @@
 """Draw the figures of the documentation.
 
     python recipes/tables/figures.py section-4 learning-return    # from runs of evaluations and trainings
-    python recipes/tables/figures.py conditions globe --out runs  # from new flights; five minutes and one minute
+    python recipes/tables/figures.py conditions --out runs                # from new flights; five minutes
 
 From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
-alone), globe (a map of the Earth), reliability (of stated probabilities). From runs: section-4 (field contours 4-1,
+alone), reliability (of stated probabilities). From runs: section-4 (field contours 4-1,
 trajectories 4-4, convergence 4-5, box plots 4-6), and the learning curves of figures.toml.
 """
 
@@ -21,15 +21,16 @@ from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation import figures as plots
+from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import label
-from magrl.field import IGRF
+from magrl.field import IGRF, elements_gradient_at
 from magrl.files import check_writable, read_text, write_text, write_with
-from magrl.sensor_std import PERFECT
 from magrl.tracking import Rules
 from magrl.training import UsageError, command
 from magrl.transforms import Conditions, TrackField, load_conditions
 from magrl.transforms.track import known_keys
 
+import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
@@ -38,7 +39,6 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
 from flights import Flights, matching, place_errors, reliability
-from globe import earth_tasks, globe_map, measured, two_elements_map
 from grid import RUNS, declared
 
 RECIPE = "figures.py"
@@ -134,12 +134,6 @@ def conditions(tasks: int = 200) -> Figures:
     return {"figures/conditions": figure}
 
 
-def globe(tasks: int = 10_000) -> Figures:
-    """Return the map of the tasks of table globe, with perfect sensors."""
-    ends = earth_tasks(tasks)
-    return {"figures/globe": globe_map(ends, measured("anywhere", ends, PERFECT.noise))}
-
-
 def reliability_diagram(tasks: int = 2000) -> Figures:
     """Return the share of readings at which `anywhere` is within 25 km, over the probability that it states.
 
@@ -184,12 +178,31 @@ def place_error(tasks: int = 64) -> Figures:
     return {"figures/place-error": figure}
 
 
+def two_elements() -> Figures:
+    """Return the map of the angle between the gradients of I and B_H: where it is small, two elements give a line and
+    not a place."""
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    axes = figure.add_subplot(projection="mollweide")
+    latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
+    places = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
+    north, east = elements_gradient_at(IGRF("2025-01-01"), places)[..., 1:, :].unbind(-1)
+    bearing = torch.rad2deg(torch.atan2(east, north))
+    angle = 90 - (bearing.diff(dim=-1).squeeze(-1).remainder(180) - 90).abs()
+    where = np.radians(longitude.numpy()), np.radians(latitude.numpy())
+    filled = axes.contourf(*where, angle, [0, 5, 10, 20, 45, 90], cmap="viridis")
+    axes.plot(*np.radians(coastlines()).T[::-1], color="white", lw=0.6)
+    weight = torch.cos(torch.deg2rad(latitude)) * (latitude.abs() < 60)
+    share = (weight @ (angle < 5).double().mean(-1)) / weight.sum()
+    axes.set(xticklabels=[], yticklabels=[], title=f"below 5° at {100 * share:.0f} % of places between 60° S and 60° N")
+    figure.colorbar(filled, shrink=0.7, pad=0.02, label="angle between the gradients of I and B_H [°]")
+    return {"figures/two-elements": figure}
+
+
 FIGURES: Mapping[str, Callable[..., Figures]] = {
     "place-error": place_error,
     "section-4": section_4,
     "conditions": conditions,
-    "globe": globe,
-    "two-elements": lambda: {"figures/two-elements": two_elements_map()},
+    "two-elements": two_elements,
     "reliability": reliability_diagram,
 }
 
@@ -199,7 +212,7 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
 
     Args:
         figures: Names of figures.
-        tasks: Number of tasks of new flights; by default 64 to 10 000, by figure.
+        tasks: Number of tasks of new flights; by default 64 to 2000, by figure.
         out: Folder of the folders figures and results; files of the same name are replaced.
 
     Raises:

@@ -37,7 +37,6 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 sys.path.insert(0, str(Path(__file__).parent))
 from evaluate import Config, evaluate
 
-import globe
 from flights import MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of
 
 RECIPE = "grid.py"
@@ -111,7 +110,7 @@ def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> Ta
     return Table(read_text(folder / "table.md"), [episodes.assign(**added)[list(COLUMNS)]])
 
 
-KINDS: Mapping[str, Callable[..., Table]] = {"flights": flights, "globe": globe.globe, "evaluation": evaluation}
+KINDS: Mapping[str, Callable[..., Table]] = {"flights": flights, "evaluation": evaluation}
 """Function of each kind of table; its arguments are the options in the file."""
 
 

@@ -1,11 +1,9 @@
 """Tables and figures from their declarative files: flights and cells by hand, and files that are named."""
 
-import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -14,15 +12,12 @@ from tensordict import TensorDict
 
 from magrl import benchmark
 from magrl.benchmark import COLUMNS, LEVELS, read_episodes
-from magrl.envs import Scenario, Tasks
-from magrl.field import IGRF
 from magrl.training import UsageError
 from magrl.transforms import CONDITIONS
 
 sys.path.insert(0, str(RECIPES / "tables"))
 import figures
 import flights
-import globe
 import grid
 import publish
 
@@ -52,7 +47,7 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
     [
         (("mars",), {}, "declares no table mars: choose from"),
         (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
-        (("globe",), {"confidence": 0.9}, "globe: .* unexpected keyword argument 'confidence'"),
+        (("comparison",), {"navigators": ("secant",), "jobs": 2}, "comparison: .* unexpected keyword argument 'jobs'"),
         (("noise",), {}, "there is no runs/.*: train it by make tables"),
     ],
 )
@@ -209,71 +204,6 @@ def test_reliability_counts_readings_by_their_probability() -> None:
     assert stated == pytest.approx(55)
     assert share == pytest.approx(60)
     assert half == pytest.approx(1.96 * 2 * 100 * 200 * 0.6 * 0.4 / 200)  # two equal sums, times (2 / (2 - 1)) ** 0.5
-
-
-# The globe
-
-
-class Slopes:
-    """A field of 30 000 nT to the north, in which D and I change by some floors of the objective over 25 km."""
-
-    def __init__(self, declination: tuple[float, float], inclination: tuple[float, float]) -> None:
-        self.gradient = torch.zeros(3, 2, dtype=torch.float64)
-        for row, floor, slope in ((1, 0.05, declination), (2, 0.4, inclination)):
-            self.gradient[row] = 30_000 * torch.tensor(slope).double() * math.radians(floor) / 25
-
-    def value_and_gradient(self, latitude: torch.Tensor, longitude: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = torch.broadcast_shapes(latitude.shape, longitude.shape)
-        return torch.tensor([30_000.0, 0, 0]).double().expand(*shape, 3), self.gradient.expand(*shape, 3, 2)
-
-
-def test_weakest_change_is_in_floors_of_the_objective() -> None:
-    here = torch.zeros(1, 2, dtype=torch.float64)
-    assert globe.weakest_change(here, Slopes((2, 0), (0, 3))).item() == pytest.approx(2)
-    assert globe.weakest_change(here, Slopes((3, 3), (1, -1))).item() == pytest.approx(math.sqrt(2))
-    assert globe.weakest_change(here, Slopes((2, 4), (1, 2))).item() == pytest.approx(0, abs=1e-9)
-
-
-def test_vehicles_cross_the_pole_and_are_not_lost() -> None:
-    start, target = torch.tensor([[89.9, 20.0]]).double(), torch.tensor([[86.0, -160.0]]).double()
-    scenario = Scenario(region=globe.EARTH, margin_deg=0, field=IGRF("2025-01-01"), tasks=Tasks(start, target))
-    env = globe.GlobeEnv(scenario, num_envs=1, seed=0)
-    after = env.step(env.reset().set("action", torch.tensor([[50.0, 0.0]])))["next"]
-    assert after["position"][0].tolist() == pytest.approx([89.652, -160.0], abs=1e-3)  # a degree is 111.7 km there
-    assert not after["terminated"].item()
-    assert env.observation_spec.is_in(env.reset())
-
-
-def test_table_has_every_task_once_in_each_group(monkeypatch) -> None:
-    success = torch.tensor([True, False, True, True])
-    measures = {"success": success, "spl": torch.tensor([1.0, 0.0, 0.9, 0.7]), "steps": torch.tensor([8, 50, 10, 12])}
-    measures |= dict.fromkeys(("length_km", "navigation_error_km", "path_efficiency"), torch.ones(4))
-    measures |= dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.ones(4))
-    places = {
-        "latitude": torch.tensor([0.0, 89.0, 30.0, 74.0]),
-        "intensity_nt": torch.tensor([30e3, 0.0, 8e3, 7e3]),
-        "weakest": torch.tensor([2.0, 0.01, 0.5, 0.05]),
-    }
-    table = rows(globe.table({"perfect sensors": measures}, places))[2:]
-    assert table[0] == ["all", "4", "75.0 / 65.0"]
-    assert table[1] == ["latitude of the start 0 to 30°", "1", "100.0 / 100.0"]
-    for group in ("latitude", "smallest", "weakest"):
-        assert sum(int(row[1]) for row in table if row[0].startswith(group)) == 4, group
-    assert table[-1] == ["weakest change on the way 0.5 and more", "2", "100.0 / 95.0"]
-    monkeypatch.setattr(globe, "CHUNK", 3)  # flown in parts
-    assert "| all | 4 | 100.0 / 100.0 |" in globe.globe(["geodesic"], tasks=4).text
-
-
-def test_map_shows_the_dip_poles_and_the_failures() -> None:
-    tasks = Tasks(torch.tensor([[10.0, 20.0], [50.0, -60.0]]), torch.tensor([[10.0, 24.0], [50.0, -64.0]]))
-    measures = {"success": torch.tensor([True, False]), "spl": torch.tensor([0.9, 0.0])}
-    axes = globe.globe_map(tasks, measures).axes[0]
-    lines = {line.get_label(): np.degrees(np.stack(line.get_data(), -1)) for line in axes.lines}
-    (south_east, south), (north_east, north) = lines["dip pole"]  # NOAA, 2025: 63.85 S 135.08 E, 85.76 N 139.30 E
-    assert (south, south_east) == pytest.approx((-63.85, 135.08), abs=1)
-    assert (north, north_east) == pytest.approx((85.76, 139.3), abs=6)
-    assert lines["not arrived"] == pytest.approx(np.array([[-60.0, 50.0]]))
-    assert axes.collections[-1].get_array() == pytest.approx(np.array([90.0]))
 
 
 # Figures
