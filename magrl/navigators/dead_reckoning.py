@@ -62,7 +62,7 @@ class DeadReckoning(Navigator):
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return the reckoned place ``(N, 2)``."""
-        return {"place": _known(seen, 0).double()}
+        return {"place": _known(seen, 0).double().clone()}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
         """Return the action toward the destination."""

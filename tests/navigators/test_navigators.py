@@ -74,9 +74,11 @@ def test_a_navigator_that_is_told_of_its_arrival_searches() -> None:
 
 
 def test_dead_reckoning_declares_at_the_reckoned_destination() -> None:
-    """Without errors, and so at the destination itself."""
+    """Without errors, and so at the destination itself; the start that it reads is left as it was."""
     env = GeomagneticNavEnv(num_envs=20, seed=0, arrival="declared")
-    end = evaluation_rollout(env, make_navigator("dead_reckoning", env))["next"][:, -1]
+    flight = evaluation_rollout(env, make_navigator("dead_reckoning", env))
+    assert (flight["start_position"] == flight["position"][:, :1]).all()
+    end = flight["next"][:, -1]
     assert end["declared"].all()
     assert geodesic(*end["position"].T, *end["target_position"].T)[0].max() < 0.5
 
