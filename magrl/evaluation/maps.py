@@ -326,12 +326,30 @@ def write_gif(
         b'GIF'
     """
     check_number(1, whole=True, width_px=width_px)
-    frames = list(_frames(rollout.cpu(), field, one_region(region), title, width_px))
+    save_gif(Path(path), list(_frames(rollout.cpu(), field, one_region(region), title, width_px)))
+
+
+def save_gif(path: Path, frames: Sequence[Image.Image], frame_ms: int = FRAME_MS, last_ms: int = LAST_FRAME_MS) -> None:
+    """Write images as an animated GIF that loops; an existing file is replaced.
+
+    Args:
+        path: path of the GIF.
+        frames: images of one size.
+        frame_ms: duration of a frame [ms].
+        last_ms: duration of the last one [ms].
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "dark.gif"
+        >>> save_gif(path, [Image.new("RGB", (8, 8), color) for color in ("white", "gray", "black")])
+        >>> Image.open(path).n_frames
+        3
+    """
     sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])
     palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames: unchanged pixels compress well
     start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)
-    durations = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
-    write_with(Path(path), start.save, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+    durations = [frame_ms] * len(others) + [last_ms]
+    write_with(path, start.save, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 
 def _frames(

@@ -131,10 +131,10 @@ class Around(TensorDictModuleBase):
         return ((radius + self.BESIDE_KM - beside).clamp_min(0) * (size > 0)).amax(-1)
 
 
-def flown(task: str, navigator: str) -> tuple[EnvBase, TensorDictBase]:
+def flown(task: str, navigator: str, vehicles: int | None = None) -> tuple[EnvBase, TensorDictBase]:
     """Return the environment of a task, and the first episode of each vehicle; arguments as of :func:`bar`."""
     errors = {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
-    env = NAMED_ENVS[task](VEHICLES, observation="dict", scale_actions=False, seed=SEED, **errors)
+    env = NAMED_ENVS[task](vehicles or VEHICLES, observation="dict", scale_actions=False, seed=SEED, **errors)
     rules = {"detour": Detour, "sighted": Sighted, "around": lambda: Around(Secant.for_env(env.base_env))}
     name = "kalman" if navigator == "told" else navigator
     policy = rules[name]() if name in rules else make_navigator(name, env.base_env)

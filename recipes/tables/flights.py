@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import glob
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from magrl.benchmark import TRACKS, Track
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.tables import about, mean_of_runs
-from magrl.geodesy import geodesic, move_place
+from magrl.files import check_writable, write_with
+from magrl.geodesy import geodesic, move_place, polar
 from magrl.sensor_std import Noise
 from magrl.transforms import Conditions
 
 import torch
+from matplotlib.figure import Figure
 from pandas import DataFrame
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -105,28 +109,42 @@ def reliability(flight: TensorDictBase, region: Tensor, radius_km: float) -> lis
     return [(100 * stated[one].mean().item(), *clustered(100 * right[one].double(), region[one])) for one in chosen]
 
 
-def place_errors(steps: TensorDictBase) -> dict[str, Tensor]:
-    """Return the errors of the place ``(N, T)`` [km] after each step of flights, NaN after their end.
+def believed_places(steps: TensorDictBase) -> dict[str, Tensor]:
+    """Return where vehicles are by compass and log, and by their track with a model, ``(N, T, 2)`` [deg] each.
 
     Args:
         steps: ``(N, T)`` after each step, with a track between known places.
     """
     true, target = (steps[key].double() for key in ("position", "target_place"))
-    over = first_episode_mask(steps["done"]).squeeze(-1).logical_not()
-
-    def apart(place: Tensor) -> Tensor:
-        distance, bearing = geodesic(*place.unbind(-1), *target.unbind(-1))
-        return distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
-
     reckoned = [steps["start_place"][:, 0].double()]
     for number in range(steps.shape[1]):  # the heading is that of the leg before
         move = steps["move"][:, number, 0].double()
         reckoned.append(move_place(reckoned[-1], steps["heading"][:, number, 0].double(), move))
-    errors = {
-        "compass and log": geodesic(*torch.stack(reckoned[1:], 1).unbind(-1), *true.unbind(-1))[0],
-        "and IGRF-13": (steps["track", "way", "displacement"].double() - apart(true)).norm(dim=-1),
+    distance, bearing = geodesic(*true.unbind(-1), *target.unbind(-1))
+    left = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+    length, heading = polar(left - steps["track", "way", "displacement"].double())
+    return {"compass and log": torch.stack(reckoned[1:], 1), "and IGRF-13": move_place(true, heading, length)}
+
+
+def place_errors(steps: TensorDictBase) -> dict[str, Tensor]:
+    """Return the errors ``(N, T)`` [km] of :func:`believed_places`, NaN after the end of a flight."""
+    over = first_episode_mask(steps["done"]).squeeze(-1).logical_not()
+    true = steps["position"].double().unbind(-1)
+    return {
+        name: geodesic(*place.unbind(-1), *true)[0].masked_fill(over, torch.nan)
+        for name, place in believed_places(steps).items()
     }
-    return {name: error.masked_fill(over, torch.nan) for name, error in errors.items()}
+
+
+def digest(data: Path) -> str:
+    """Return the digest of the data of a picture."""
+    return hashlib.sha256(data.read_bytes()).hexdigest()[:16]
+
+
+def write_picture(path: Path, figure: Figure, data: Path | None = None, dpi: int = 110) -> None:
+    """Write a figure; of one that is drawn from a file, the digest of that file is its description."""
+    check_writable(path)
+    write_with(path, figure.savefig, dpi=dpi, metadata={"Description": digest(data)} if data else {})
 
 
 def matching(pattern: str) -> list[str]:

@@ -1,0 +1,249 @@
+"""Draw the pictures of the README: an underwater vehicle in an unknown current, and an episode of each named task.
+
+    python recipes/tables/pictures.py    # docs/figures/underwater.gif and task-*.png; two minutes
+
+The flights of the animation are those of the listing "Simulate your vehicle" of docs/vehicles.md: 100 tasks by dead
+reckoning and by kalman, of which it shows one that dead reckoning misses.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from magrl import earth_scenario
+from magrl.envs import Region
+from magrl.envs.navigation import NAMED_ENVS
+from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
+from magrl.evaluation import Flight, episode_measures, evaluation_rollout
+from magrl.evaluation.episodes import first_episode_mask
+from magrl.evaluation.maps import LAND, coastlines, save_gif, way_ellipse
+from magrl.field import IGRF, FieldModel
+from magrl.field.elements import UNITS
+from magrl.files import write_with
+from magrl.geodesy import geodesic
+from magrl.tracking import Rules
+from magrl.training import command
+from magrl.transforms import CONDITIONS, TrackField
+from magrl.transforms.areas import outlines
+from magrl.transforms.track import known_keys
+
+import numpy as np
+import torch
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+sys.path.insert(0, str(Path(__file__).parent))
+from bars import flown
+from flights import believed_places
+
+SHOWN, WITHIN_KM = 44, 25.0
+"""Task of the animation, chosen because a coast is in sight, and the radius of arrival."""
+FIELD = IGRF("2025-01-01")
+GRAY, BLUE = "#707070", "#0072B2"
+KM_PER_DEG, ROOM_KM = 111.2, 30.0
+COUNTER = ((0.63, "black"), (0.65, GRAY), (0.785, "black"), (0.82, BLUE))
+"""Place and color of each part of the counter."""
+PIECE_KM, FRAME_MS, LAST_MS = 6.0, 120, 3000
+"""Longest distance between two frames, and their durations."""
+REFERENCES = dict.fromkeys(NAMED_ENVS, "kalman") | {"nogo": "detour"}
+"""Agent of bars.py, by task."""
+COLORS, VEHICLES, EPISODES = 256, 16, {"box": 3, "anywhere": 2, "readings": 5, "storm": 4, "nogo": 7}
+"""Colors of a map, vehicles of a rollout, and the one that is shown, by task."""
+
+
+class Trip(NamedTuple):
+    """A flight at the start and after each step: true and believed places ``(T + 1, 2)`` [deg], and the covariance of
+    the belief ``(T + 1, 2, 2)`` [km^2]."""
+
+    true: Tensor
+    believed: Tensor
+    covariance: Tensor
+
+    @property
+    def error_km(self) -> float:
+        """Error of the belief at the end."""
+        return apart_km(self.true[-1], self.believed[-1])
+
+    @classmethod
+    def of(cls, steps: TensorDictBase, belief: str) -> Trip:
+        """Return the trip of an episode ``(T,)`` by one of :func:`believed_places`."""
+        steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
+        places = believed_places(steps["next"][None])[belief][0]
+        key = "track", "way", "covariance"
+        pairs = ("position", steps["next", "position"]), ("start_place", places), (key, steps["next", *key])
+        return cls(*(torch.cat((steps[name][:1], after)).double() for name, after in pairs))
+
+    def at(self, time: float) -> Trip:
+        """Return the trip up to a time in steps; after its end, all of it."""
+        step, last = int(time), len(self.true) - 1
+        if time >= last:
+            return self
+        return Trip(
+            *(torch.cat((part[: step + 1], torch.lerp(*part[step : step + 2], time % 1)[None])) for part in self)
+        )
+
+
+def trips() -> tuple[Tensor, dict[str, tuple[Trip, int]]]:
+    """Return the destination of the task that is shown, and trip and number of arrivals of each navigator."""
+    scenario = earth_scenario(64, seed=0, distance_range_km=(300.0, 500.0), max_move_km=90.0)  # room for the current
+    scenario = scenario.replace(max_move_km=50.0, max_steps=120, arrival="declared", start_heading="random")
+    scenario = scenario.with_tasks(scenario.random_tasks(100, seed=0))
+    auv, made = replace(CONDITIONS["underwater"], north={"constant_deg": 0.5}), {}
+    for name, belief in (("dead_reckoning", "compass and log"), ("kalman", "and IGRF-13")):
+        flight = Flight(scenario, errors=auv, model="IGRF-13", start_km=5.0, confidence=0.8)
+        track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
+        steps = evaluation_rollout(TransformedEnv(flight.env, track, auto_unwrap=True), flight.navigator(name))
+        made[name] = Trip.of(steps[SHOWN], belief), int(episode_measures(steps)["success"].sum())
+    return steps[SHOWN, 0]["target_position"].double(), made
+
+
+class Animation:
+    """Two trips on a map, drawn at any time.
+
+    Args:
+        target: destination ``(2,)`` [deg].
+        reckoning: trip of dead reckoning.
+        filtered: trip of kalman.
+    """
+
+    def __init__(self, target: Tensor, reckoning: Trip, filtered: Trip) -> None:
+        self.target, self.trips = target, (reckoning, filtered)
+        self.figure = Figure(figsize=(7.2, 7.4), dpi=100)
+        axes = self.figure.add_axes((0.01, 0.13, 0.98, 0.79))
+        draw_map(axes, FIELD, torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None])))
+        circle = way_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
+        axes.plot(*circle.T.flip(0), color=TARGET, lw=2.5)
+        axes.plot(*target.flip(-1)[:, None], "^", color=TARGET, ms=13, zorder=3)
+        (self.ellipse,) = axes.fill([0], [0], fc=(*to_rgb(BLUE), 0.25), ec=BLUE, lw=2, label="its estimate, 2σ")
+        self.lines = [
+            axes.plot([], [], style, color=color, lw=3, ms=9, mew=2.5, mfc=fill, markevery=[-1], label=label)[0]
+            for style, color, fill, label in (
+                ("o--", GRAY, "white", "where it believes it is"),
+                ("o-", GRAY, GRAY, "dead reckoning"),
+                ("o-", BLUE, BLUE, "magrl (kalman)"),
+            )
+        ]
+        handles = [self.lines[1], self.lines[0], self.lines[2], self.ellipse]
+        self.figure.legend(handles=handles, loc="lower center", ncols=2, fontsize=18, frameon=False)
+        self.texts = [self.figure.text(x, 0.957, "", color=color, fontsize=19, va="center") for x, color in COUNTER]
+        self.texts[0].set_ha("right")
+
+    def image(self, time: float, verdict: str = "") -> Image.Image:
+        """Return the map at a time in steps, with a text in its middle."""
+        here, there = (trip.at(time) for trip in self.trips)
+        for line, places in zip(self.lines, (here.believed, here.true, there.true), strict=True):
+            line.set_data(*places.T.flip(0))
+        ellipse = way_ellipse(there.believed[-1], torch.zeros(2), there.covariance[-1])
+        self.ellipse.set_xy(ellipse.flip(-1))
+        before = [trip.at(int(time)) for trip in self.trips]
+        error, other = (f"{trip.error_km:.0f} km" for trip in before)
+        left = apart_km(before[1].true[-1], self.target)
+        shown = (f"step {int(time)} · {left:.0f} km to go · error", error, "/", other)
+        for text, content in zip(self.texts, shown, strict=True):
+            text.set_text(content)
+        if verdict:
+            box = {"facecolor": "white", "edgecolor": BLUE, "lw": 2, "pad": 16}
+            self.figure.text(0.5, 0.74, verdict, fontsize=27, ha="center", va="center", linespacing=1.6, bbox=box)
+        return image_of(self.figure)
+
+    def frames(self, verdict: str) -> Iterator[Image.Image]:
+        """Yield images at most :data:`PIECE_KM` apart, and the verdict."""
+        for step in range(len(self.trips[1].true) - 1):
+            legs = [apart_km(*(trip.at(end).true[-1] for end in (step, step + 1))) for trip in self.trips]
+            pieces = max(1, math.ceil(max(legs) / PIECE_KM))
+            yield from (self.image(step + piece / pieces) for piece in range(pieces))
+        yield self.image(step + 1)
+        yield self.image(step + 1, verdict)
+
+
+def image_of(figure: Figure) -> Image.Image:
+    """Return a figure as an image."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def apart_km(one: Tensor, other: Tensor) -> float:
+    """Return the distance of two places ``(2,)`` [km]."""
+    return geodesic(*one, *other)[0].item()
+
+
+def draw_map(axes: Axes, field: FieldModel, places: Tensor, *, coast: bool = True) -> None:
+    """Draw contours of a field and coastlines around places ``(P, 2)`` [deg], without any text."""
+    low, high = places.amin(0), places.amax(0)
+    narrow, width, height = math.cos(math.radians((low + high)[0] / 2)), *axes.bbox.size
+    north, east = (high - low) * torch.tensor([1, narrow]) / 2 + ROOM_KM / KM_PER_DEG
+    half = max(north, east * height / width)
+    half = torch.stack((half, half * width / height / narrow))
+    box = Region(*torch.stack(((low + high) / 2 - half, (low + high) / 2 + half), -1).tolist())
+    for lines in contour_lines(axes, field, box).values():
+        lines.set_alpha(0.4)
+    if coast:
+        axes.plot(*coastlines().T[::-1], color=LAND, lw=2.5)
+    axes.set(xlim=box.longitude, ylim=box.latitude, xticks=[], yticks=[])
+
+
+def task_picture(task: str) -> Figure:
+    """Return a map of an episode of the reference agent, or on *Storm* the errors of its readings."""
+    env, rollout = flown("anywhere" if task == "readings" else task, REFERENCES[task], VEHICLES)
+    steps = rollout[EPISODES[task]]
+    steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
+    figure = Figure(figsize=(3, 3), dpi=100)
+    if task == "storm":
+        draw_errors(figure, steps["field"] - steps["true_field"])
+        return figure
+    axes, index = figure.add_axes((0.01, 0.01, 0.98, 0.98)), steps["region"][0, 0]
+    field = partial(env.field, index=index) if len(env.region) > 1 else env.field
+    path = env.region[index].unwrapped(torch.cat((steps["position"][:1], steps["next", "position"])).double())
+    target = env.region[index].unwrapped(steps["target_position"][:1].double())
+    rings = outlines(steps["no_go_areas"][0], target[0]) if task == "nogo" else path.new_empty(0, 1, 2)
+    draw_map(axes, field, torch.cat((path, target, rings.flatten(0, 1))), coast=task in ("box", "nogo"))
+    for ring in rings:
+        axes.fill(*ring.T.flip(0), color=AREA, alpha=0.5)
+    axes.plot(*path.T.flip(0), ".-", color=BLUE, lw=2, ms=8)
+    axes.plot(*path[0].flip(0)[:, None], "s", color=START, ms=9)
+    axes.plot(*target.T.flip(0), "^", color=TARGET, ms=10)
+    return figure
+
+
+def draw_errors(figure: Figure, errors: Tensor) -> None:
+    """Draw errors ``(T, 3)`` of readings by step, a panel for each element."""
+    panels = figure.subplots(3, sharex=True, gridspec_kw={"left": 0.19, "right": 0.98, "bottom": 0.15, "top": 0.98})
+    for axes, values, (name, color), unit in zip(panels, errors.T, ELEMENT_COLORS.items(), UNITS, strict=True):
+        axes.plot(values, color=color, lw=1.5)
+        axes.axhline(0, color=AREA, lw=0.8)
+        axes.annotate(f"{SYMBOLS[name]} [{unit}]", (0.02, 0.78), xycoords="axes fraction")
+        axes.margins(0.02, 0.35)
+    panels[-1].set_xlabel("step")
+
+
+def main(out: Path = Path("docs/figures")) -> None:
+    """Draw all pictures.
+
+    Args:
+        out: Folder of the pictures, which are replaced.
+    """
+    target, flights = trips()
+    (reckoning, few), (filtered, many) = flights.values()
+    frames = Animation(target, reckoning, filtered).frames(f"dead reckoning {few} of 100,\nmagrl {many} of 100 arrive")
+    save_gif(out / "underwater.gif", list(frames), FRAME_MS, LAST_MS)
+    for task in NAMED_ENVS:
+        picture = image_of(task_picture(task)).quantize(COLORS)
+        write_with(out / f"task-{task}.png", partial(picture.save, format="PNG"))
+
+
+if __name__ == "__main__":
+    command("pictures.py", lambda: tyro.cli(main, prog="pictures.py", description=__doc__))
