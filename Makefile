@@ -63,23 +63,18 @@ mutate: $(VENV)/.installed-dev  ## try random mutants of the code, 40 or ARGS="-
 # Tables and figures. Runs that exist are used again; `make -j2` trains and makes two at a time, with one thread each.
 ONE := OMP_NUM_THREADS=1 $(RECIPE)
 FIVE := 0 1 2 3 4
-GUIDED := $(addprefix td3_gradient_guided-fast-one-thread-seed,$(FIVE) 5 6 7 8 9 $(addprefix 1,$(FIVE) 5 6 7 8 9))
-PLAIN := $(addprefix td3-fast-seed,$(FIVE))
-NOISY := $(GUIDED) $(addprefix td3_gradient_guided-fast-noise-0.05-0.05-5-seed,$(FIVE))
-WHOLE := td3_gradient_guided-paper-seed0 td3-paper-seed0
-RUNS_table-comparison := $(GUIDED) $(PLAIN)
-RUNS_table-noise := $(NOISY)
-RUNS_table-paper-run := $(WHOLE)
-RUNS_figure-learning-return := $(GUIDED) $(PLAIN)
-RUNS_figure-learning-success := $(GUIDED) $(PLAIN)
-RUNS_figure-paper-run := $(WHOLE)
+AGENTS := $(foreach run,td3_gradient_guided-fast td3_gradient_guided-fast-no-cost td3-fast td3-fast-cost,$(FIVE:%=$(run)-seed%))
+RUNS_table-comparison := $(AGENTS)
+RUNS_figure-learning := $(AGENTS)
+RUNS_table-noise := $(foreach run,td3_gradient_guided-fast td3_gradient_guided-fast-noise,$(FIVE:%=$(run)-seed%))
+RUNS_table-paper-run := td3_gradient_guided-paper-seed0 td3-paper-seed0
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= place-error section-4 conditions globe two-elements reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
+FIGURES ?= place-error section-4 learning conditions two-elements reliability
 
 tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
 	$(RECIPE)/tables/publish.py README.md $(wildcard docs/*.md)
 
-figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="globe"; section-4 after table comparison
+figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="place-error"; section-4 after table comparison
 
 .SECONDARY:  # keep the runs
 .SECONDEXPANSION:
@@ -89,9 +84,8 @@ table-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_$
 figure-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_$$@)))
 	$(ONE)/tables/figures.py $*
 
-pictures: $(VENV)/.installed  ## animate the flight of the README
-	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors 0.05 0.05 5 --title "Bergen → Reykjavik" --out runs/flight \
-		--animate docs/figures/flight.gif
+pictures: $(VENV)/.installed  ## draw the pictures of the README; two minutes
+	$(ONE)/tables/pictures.py
 
 # Trainings: name of the run, recipe and options.
 define training
@@ -99,9 +93,10 @@ runs/$(1)-seed%/eval.json: | $(VENV)/.installed
 	$(ONE)/$(2) --seed $$* --out $$(@D)
 endef
 $(eval $(call training,td3_gradient_guided-fast,td3_gradient_guided.py))
-$(eval $(call training,td3_gradient_guided-fast-one-thread,td3_gradient_guided.py))
-$(eval $(call training,td3_gradient_guided-fast-noise-0.05-0.05-5,td3_gradient_guided.py --noise 0.05 0.05 5))
+$(eval $(call training,td3_gradient_guided-fast-no-cost,td3_gradient_guided.py --distance-cost 0))
+$(eval $(call training,td3_gradient_guided-fast-noise,td3_gradient_guided.py --noise 0.05 0.05 5))
 $(eval $(call training,td3-fast,td3_gradient_guided.py --preset td3-fast))
+$(eval $(call training,td3-fast-cost,td3_gradient_guided.py --preset td3-fast --distance-cost 0.1))
 $(eval $(call training,td3_gradient_guided-paper,td3_gradient_guided.py --preset paper))
 $(eval $(call training,td3-paper,td3_gradient_guided.py --preset td3-paper))
 

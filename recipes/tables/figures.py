@@ -1,11 +1,11 @@
 """Draw the figures of the documentation.
 
-    python recipes/tables/figures.py section-4 learning-return    # from runs of evaluations and trainings
-    python recipes/tables/figures.py conditions --out runs                # from new flights; five minutes
+    python recipes/tables/figures.py section-4 learning    # from runs of evaluations and trainings
+    python recipes/tables/figures.py conditions --out runs # from new flights; five minutes
 
 From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
 alone), reliability (of stated probabilities). From runs: section-4 (field contours 4-1,
-trajectories 4-4, convergence 4-5, box plots 4-6), and the learning curves of figures.toml.
+trajectories 4-4, convergence 4-5, box plots 4-6), and learning (return 4-2, success rate 4-3, with their data).
 """
 
 from __future__ import annotations
@@ -34,17 +34,29 @@ import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
+from pandas import DataFrame, concat, read_csv
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
-from flights import Flights, matching, place_errors, reliability
+from flights import Flights, matching, place_errors, reliability, write_picture
 from grid import RUNS, declared
 
 RECIPE = "figures.py"
 FILE = Path(__file__).parent / "figures.toml"
-Figures = Mapping[str, Figure]
-"""Figures by file, from the folder of the documentation."""
+Figures = Mapping[str, Figure | DataFrame]
+"""Figures by file, from the folder of the documentation, after the data that they are drawn from."""
+FIRST_FRAMES = 512 * 50
+"""Frames after which each of 512 vehicles has made 50 steps."""
+CURVES = {
+    "results/fig-4-2-reward": ("return", "return, mean of the last 200 episodes"),
+    "results/fig-4-3-success": ("eval_success_rate", "success rate on the validation tasks [%]"),
+}
+"""Column and label of learning curves."""
+DATA = dict.fromkeys(CURVES, "results/learning.csv")
+DATA |= dict.fromkeys(("figures/fig-4-4-trajectories", "results/fig-4-5-convergence"), "results/comparison.md")
+DATA |= {"results/fig-4-6-boxes": "results/comparison.md", "figures/conditions": "results/conditions.csv"}
+"""Data of figures: the table is of the same evaluation."""
 SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
 """Navigators in the figures of Section 4."""
 PILOTS = ("anywhere", "kalman", "secant", "parallel")
@@ -81,17 +93,29 @@ def section_4() -> Figures:
     }
 
 
-def curves(name: str) -> Figures:
-    """Return the learning curves of a figure in figures.toml."""
-    options, values = declared(FILE)["curves"][name], {}
-    for navigator, pattern in options["runs"].items():
-        texts = [read_text(Path(run) / "train.csv").splitlines() for run in matching(pattern)]
-        columns = [
-            [[float(row[key] or "nan") for row in csv.DictReader(text)] for key in ("frames", options["column"])]
-            for text in texts
-        ]
-        values[navigator] = [(frames, column) for frames, column in columns]
-    return {options["file"]: plots.learning_curves(values, options["label"])}
+def learning() -> Figures:
+    """Return the learning curves of the runs in figures.toml, and their data.
+
+    Returns are means over the last 200 episodes, shown from where every vehicle has ended one: before, only short
+    episodes have ended. Success rates are on the validation tasks.
+    """
+    runs = [
+        read_csv(Path(run) / "train.csv").assign(navigator=name, run=number)
+        for name, pattern in declared(FILE)["learning"].items()
+        for number, run in enumerate(matching(pattern))
+    ]
+    data = concat(runs)[["navigator", "run", "frames", "return", "eval_success_rate"]].round(2)
+    data["return"] = data["return"].where(data["frames"] >= FIRST_FRAMES)
+    data = data.dropna(how="all", subset=["return", "eval_success_rate"])
+    return {"results/learning": data} | {file: curves(data, *shown) for file, shown in CURVES.items()}
+
+
+def curves(data: DataFrame, column: str, label: str) -> Figure:
+    """Return the curves of a column."""
+    names = data["navigator"].unique()
+    runs = {name: [run for _, run in data[data["navigator"] == name].groupby("run")] for name in names}
+    values = {name: [(run["frames"], run[column]) for run in found] for name, found in runs.items()}
+    return plots.learning_curves(values, label)
 
 
 # From new flights
@@ -112,26 +136,36 @@ def one_error(lines: str, size: object = "") -> Conditions:
 
 
 def conditions(tasks: int = 200) -> Figures:
-    """Return a panel for each error, SPL over its size for each navigator.
+    """Return a panel for each error, SPL over its size for each navigator, and their data.
 
     Everything else is as at the noise alone, which is the first point of each panel.
     """
-    flights = Flights(["ship"], tasks=tasks)  # its environment lets errors move vehicles
-    figure, errors = Figure(figsize=(11, 7.5), layout="constrained"), declared(FILE)["errors"]
-    *panels, last = figure.subplots(3, 4, sharey=True).flat
+    flights, rows = Flights(["ship"], tasks=tasks), []  # its environment lets errors move vehicles
     for navigator in tqdm(LOOKS, unit="navigator"):
         alone = flights.summaries(navigator, one_error(""))[0]["spl"]
-        for axes, (title, error) in zip(panels, errors.items(), strict=True):
-            sizes = [one_error(error["lines"], size) for size in error["sizes"]]
-            axes.plot([alone, *(flights.summaries(navigator, size)[0]["spl"] for size in sizes)], **look(navigator))
-            axes.set_xticks(range(len(sizes) + 1), ["0", *(f"{size}".removesuffix(".0") for size in error["sizes"])])
-            axes.tick_params("x", labelsize=7)
-            axes.set_xlabel(title, fontsize=9)
-            axes.grid(alpha=0.3)
+        for title, error in declared(FILE)["errors"].items():
+            rows.append((title, "0", navigator, alone))
+            for size in error["sizes"]:
+                spl = flights.summaries(navigator, one_error(error["lines"], size))[0]["spl"]
+                rows.append((title, f"{size}".removesuffix(".0"), navigator, spl))
+    data = DataFrame(rows, columns=["error", "size", "navigator", "spl"]).round(2)
+    return {"results/conditions": data, "figures/conditions": error_panels(data)}
+
+
+def error_panels(data: DataFrame) -> Figure:
+    """Return the panels of :func:`conditions`."""
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    *panels, last = figure.subplots(3, 4, sharey=True).flat
+    for axes, (title, rows) in zip(panels, data.groupby("error", sort=False), strict=True):
+        for navigator, points in rows.groupby("navigator", sort=False):
+            axes.plot(points["size"], points["spl"], **look(navigator))
+        axes.tick_params("x", labelsize=7)
+        axes.set_xlabel(title, fontsize=9)
+        axes.grid(alpha=0.3)
     figure.supylabel("SPL [%]")
     last.axis("off")
     last.legend(*panels[0].get_legend_handles_labels(), loc="center")
-    return {"figures/conditions": figure}
+    return figure
 
 
 def reliability_diagram(tasks: int = 2000) -> Figures:
@@ -201,6 +235,7 @@ def two_elements() -> Figures:
 FIGURES: Mapping[str, Callable[..., Figures]] = {
     "place-error": place_error,
     "section-4": section_4,
+    "learning": learning,
     "conditions": conditions,
     "two-elements": two_elements,
     "reliability": reliability_diagram,
@@ -218,17 +253,18 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
     Raises:
         UsageError: for an unknown figure, or a missing file.
     """
-    available = [*FIGURES, *declared(FILE)["curves"]]
-    if unknown := [name for name in figures if name not in available] or not figures:
-        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(available)}")
+    if unknown := [name for name in figures if name not in FIGURES] or not figures:
+        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(FIGURES)}")
     options = {"tasks": tasks} if tasks else {}
     try:
         for name in figures:
-            made = FIGURES[name](**options) if name in FIGURES else curves(name)
-            for file, figure in made.items():
-                check_writable(out / f"{file}.png")
-                write_with(out / f"{file}.png", figure.savefig, dpi=110)
-                print(out / f"{file}.png")
+            for file, made in FIGURES[name](**options).items():
+                if isinstance(made, DataFrame):
+                    check_writable(out / f"{file}.csv")
+                    write_with(out / f"{file}.csv", made.to_csv, index=False)
+                else:
+                    write_picture(out / f"{file}.png", made, out / DATA[file] if file in DATA else None)
+                print(out / file)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import csv
 import ctypes
-import hashlib
 import itertools
 import os
 import resource
@@ -46,6 +45,7 @@ import torch
 import tyro
 from agents import keep_agents, save_agent
 from bars import BARS, VEHICLES, bar, bars_of, draw_areas
+from flights import write_picture
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
@@ -248,11 +248,6 @@ def figure(curves: DataFrame) -> Figure:
     return drawn
 
 
-def digest(data: bytes) -> str:
-    """Return the digest of the data of a figure."""
-    return hashlib.sha256(data).hexdigest()[:16]
-
-
 def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, and write table, data and figure."""
     config = tyro.cli(Config, description=__doc__, args=args)
@@ -274,8 +269,7 @@ def main(args: Sequence[str] | None = None) -> None:
     write_with(config.results / "scores.csv", curves.to_csv, index=False)
     write_text(config.results / "scores.md", table(curves))
     keep_agents(ends(curves), config.out, config.results / "agents")
-    about = {"Description": digest((config.results / "scores.csv").read_bytes())}  # a test compares them
-    write_with(config.results / "scores.png", figure(curves).savefig, dpi=130, metadata=about)
+    write_picture(config.results / "scores.png", figure(curves), config.results / "scores.csv", dpi=130)
 
 
 if __name__ == "__main__":

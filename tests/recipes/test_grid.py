@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from matplotlib.figure import Figure
+from PIL import Image
 from support.recipes import RECIPES
 from tensordict import TensorDict
 
@@ -60,7 +61,7 @@ def test_bad_usage(tables, changes: dict, message: str, tmp_path: Path, monkeypa
     with pytest.raises(UsageError, match="No such file"):
         figures.draw(("section-4",))
     with pytest.raises(UsageError, match=r"there is no runs/.*seed"):
-        figures.draw(("learning-return",))
+        figures.draw(("learning",))
 
 
 def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
@@ -227,17 +228,22 @@ def test_the_reliability_diagram_has_a_panel_for_noise_and_one_for_vehicles(monk
 
 
 def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) -> None:
+    """Returns begin where every vehicle has ended an episode, success rates at the first evaluation."""
     monkeypatch.chdir(tmp_path)
-    for run, spl in (("td3_gradient_guided-paper-seed0", 90), ("td3-paper-seed0", 80)):
+    monkeypatch.setattr(figures, "declared", lambda _: {"learning": {"gg_td3": "runs/guided*", "td3": "runs/plain*"}})
+    for run, last in (("guided", 90), ("plain-seed0", 80), ("plain-seed1", 60)):
         (tmp_path / "runs" / run).mkdir(parents=True)
-        (tmp_path / "runs" / run / "train.csv").write_text(
-            f"frames,eval_spl\n0,\n100,50\n200,{spl}\n", encoding="utf-8"
-        )
-    (figure,) = figures.curves("paper-run").values()
-    means = [line.get_ydata()[-1] for line in figure.axes[0].lines if line.get_label().startswith(("TD3", "Gradient"))]
-    assert means == [90, 80]
-    figures.draw(("paper-run",), out=tmp_path)
-    assert (tmp_path / "figures" / "paper-run.png").read_bytes().startswith(b"\x89PNG")
+        rows = ["frames,return,eval_success_rate", "10240,200,40", f"{figures.FIRST_FRAMES},1,", f"60000,100,{last}"]
+        (tmp_path / "runs" / run / "train.csv").write_text("\n".join(rows), encoding="utf-8")
+    data, reward, success = figures.learning().values()
+    assert data.groupby("navigator")["run"].nunique().to_dict() == {"gg_td3": 1, "td3": 2}
+    for figure, first in ((reward, [figures.FIRST_FRAMES, 1]), (success, [10240, 40])):
+        means = [line for line in figure.axes[0].lines if "seed" in line.get_label()]
+        assert [line.get_xydata()[0].tolist() for line in means] == [first, first]
+    assert [line.get_ydata()[-1] for line in means] == [90, 70]
+    figures.draw(("learning",), out=tmp_path)
+    with Image.open(tmp_path / "results" / "fig-4-2-reward.png") as picture:
+        assert picture.info["Description"] == flights.digest(tmp_path / "results" / "learning.csv")
 
 
 def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeypatch) -> None:

@@ -1,0 +1,78 @@
+"""The pictures of the README, and the data that pictures of the documentation are drawn from."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageSequence
+from support.recipes import RECIPES
+
+from magrl.transforms.areas import NUMBER
+
+sys.path.insert(0, str(RECIPES / "tables"))
+import figures
+import flights
+import pictures
+
+DOCS = RECIPES.parent / "docs"
+DRAWN = figures.DATA | {"results/scores": "results/scores.csv"}
+OTHERS = {"fig-4-1-contours", "two-elements"}  # of the field alone
+OTHERS |= {"place-error", "reliability", *(f"task-{task}" for task in pictures.NAMED_ENVS)}  # flights
+OTHERS |= {"raw_log", "plume", "cost-by-vehicles"}  # an example, a training, a benchmark
+
+
+@pytest.mark.parametrize("path", sorted(DOCS.glob("*/*.png")), ids=lambda path: path.stem)
+def test_pictures_show_the_published_data(path) -> None:
+    data = DRAWN.get(f"{path.parent.name}/{path.stem}")
+    assert (data is None) == (path.stem in OTHERS)
+    with Image.open(path) as picture:
+        assert picture.info.get("Description") == (flights.digest(DOCS / data) if data else None)
+
+
+def trip(*believed: float) -> pictures.Trip:
+    """Three places on a meridian, a degree apart, and what the vehicle believes instead."""
+    true = torch.tensor([[0.0, 50.0], [1.0, 50.0], [2.0, 50.0]]).double()
+    places = torch.tensor([[place, 50.0] for place in believed]).double()
+    return pictures.Trip(true, places, 25.0 * torch.eye(2).double().expand(3, 2, 2))
+
+
+def test_a_trip_moves_between_its_steps_and_stays_at_its_end() -> None:
+    flown = trip(0.0, 1.5, 2.5)
+    assert flown.at(1.5).true[:, 0].tolist() == [0, 1, 1.5]
+    assert flown.at(1.5).believed[-1].tolist() == [2, 50]
+    assert flown.at(9) is flown
+    assert flown.error_km == pytest.approx(55.3, abs=0.1)
+
+
+def test_the_counter_shows_the_step_before(monkeypatch) -> None:
+    monkeypatch.setattr(pictures, "PIECE_KM", 60.0)
+    shown = pictures.Animation(torch.tensor([3.0, 50.0]).double(), trip(0.0, 1.5, 2.5), trip(0.0, 1.1, 2.0))
+    frames = list(shown.frames("98 of 100"))
+    assert len(frames) == 2 * 2 + 2
+    assert (np.asarray(frames[-1]) != np.asarray(frames[-2])).any()
+    shown.image(1.5)
+    assert [text.get_text() for text in shown.texts] == ["step 1 · 221 km to go · error", "55 km", "/", "11 km"]
+    assert shown.lines[2].get_ydata().tolist() == [0, 1, 1.5]
+
+
+def test_the_map_of_nogo_has_its_areas_and_ends_at_the_destination(monkeypatch) -> None:
+    monkeypatch.setattr(pictures, "VEHICLES", 8)
+    axes = pictures.task_picture("nogo").axes[0]
+    track, start, end = axes.lines[-3:]
+    assert len(axes.patches) == NUMBER
+    assert track.get_xydata()[0].tolist() == start.get_xydata()[0].tolist()
+    assert np.abs(track.get_xydata()[-1] - end.get_xydata()[0]).max() < 0.5
+
+
+def test_pictures_are_small_enough_for_a_first_screen() -> None:
+    animation = DOCS / "figures" / "underwater.gif"
+    with Image.open(animation) as picture:
+        seconds = sum(frame.info["duration"] for frame in ImageSequence.Iterator(picture)) / 1000
+        assert picture.width == 720
+    assert 10 < seconds < 14
+    assert animation.stat().st_size < 1_500_000
+    for task in pictures.NAMED_ENVS:
+        assert (DOCS / "figures" / f"task-{task}.png").stat().st_size < 40_000
