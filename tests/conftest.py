@@ -28,6 +28,14 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def few_planets() -> Iterator[None]:
+    """Fly the named tasks over 8 regions of random planets: 1024 take seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("magrl.envs.navigation.PLANET_REGIONS", 8)
+        yield
+
+
 @pytest.fixture
 def signalled(monkeypatch) -> Callable:
     """Return a context in which a training gets a signal after it has collected batch ``iteration``, counted from 1."""

@@ -30,7 +30,7 @@ def test_a_correction_scales_and_turns_the_plan() -> None:
     torch.testing.assert_close(turned, torch.tensor([[-0.2, -0.6 / math.pi]]))
 
 
-@pytest.mark.parametrize(("size", "cells"), [(0, (8,)), (13, (0,)), (13, (1.5,)), (13, (10**9,))])
-def test_bad_sizes_are_refused(size: int, cells: tuple) -> None:
-    with pytest.raises(ValueError, match="must be a whole number from 1 up to 65536"):
-        make_actor(size, cells)
+def test_bad_sizes_are_refused() -> None:
+    for size, cells in ((0, (8,)), (13, (0,)), (13, (1.5,)), (13, (10**9,))):
+        with pytest.raises(ValueError, match="must be a whole number from 1 up to 65536"):
+            make_actor(size, cells)

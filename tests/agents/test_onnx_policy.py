@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import re
 import sys
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,10 +21,8 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
+from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout
 from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
-from magrl.envs import GeomagneticNavEnv
-from magrl.evaluation import evaluate
-from magrl.evaluation.episodes import evaluation_rollout
 from magrl.transforms import ReadingView, SensorErrors
 from magrl.vehicle.onboard import Onboard
 
@@ -44,7 +40,7 @@ def plain_env(**options: object) -> EnvBase:
 
 def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) -> None:
     """By its deterministic sample, under noise; the export changes neither the actor nor random numbers."""
-    base = plain_env()
+    base = plain_env(max_steps=8)
     view = base.base_env.observation_view()
     env = TransformedEnv(base, Compose(*view.observation_transforms(), view.action_transform()), auto_unwrap=True)
     torch.manual_seed(0)
@@ -59,28 +55,14 @@ def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) 
     save_policy(tmp_path / "own.onnx", actor, view)
     assert torch.equal(torch.get_rng_state(), state)
     assert actor.training
+    assert with_paths(tmp_path) == []
     policy = load_policy(tmp_path / "own.onnx")
     assert (policy.view, policy.in_keys) == (view, ["field", "target_field", "move", "heading", "elapsed_steps"])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         wanted = evaluation_rollout(env, actor)
-    found = evaluation_rollout(plain_env(), policy)
+    found = evaluation_rollout(plain_env(max_steps=8), policy)
     assert wanted["action"].std(0).min() > 1e-3
     torch.testing.assert_close(found["next", "position"], wanted["next", "position"], rtol=1e-5, atol=1e-4)
-
-
-def test_no_file_holds_a_path_of_a_machine(tmp_path: Path) -> None:
-    """Written: exports by this library and by PyTorch alone. Shipped: weights, records, results."""
-    network = nn.Sequential(nn.Linear(READINGS.size, 2), nn.Tanh()).eval()
-    save_policy(tmp_path / "own.onnx", network, READINGS)
-    names = {"input_names": ["observation"], "output_names": ["action"], "verbose": False}
-    sizes = {"dynamic_shapes": ({0: torch.export.Dim("N")},), "dynamo": True, **names}
-    with warnings.catch_warnings(action="ignore"):
-        program = torch.onnx.export(network, (torch.zeros(3, READINGS.size),), **sizes)
-    program.save(tmp_path / "raw.onnx")
-    assert with_paths(tmp_path) == [tmp_path / "raw.onnx"]
-    save_policy(tmp_path / "raw.onnx", tmp_path / "raw.onnx", READINGS)
-    save_policy(tmp_path / "policy.safetensors", FieldPolicy(PolicyConfig(READINGS, (8,))))
-    assert with_paths(tmp_path, ROOT / "magrl", ROOT / "docs" / "results", ROOT / "docs" / "figures") == []
 
 
 class Recurrent(nn.Module):
@@ -88,11 +70,11 @@ class Recurrent(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layer, self.head = nn.GRU(9, 8, num_layers=2, batch_first=True), nn.Linear(8, 2)
+        self.layer, self.head = nn.Linear(9 + 16, 16), nn.Linear(16, 2)
 
     def forward(self, observation: Tensor, hidden: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        output, after = self.layer((observation / 1e4).unsqueeze(1), hidden.transpose(0, 1).contiguous())
-        return (self.head(output.squeeze(1)) + count / 10).tanh(), after.transpose(0, 1), count + 1
+        after = self.layer(torch.cat((observation / 1e4, hidden.flatten(1)), -1)).tanh()
+        return (self.head(after) + count / 10).tanh(), after.unflatten(-1, (2, 8)), count + 1
 
 
 class Twice(TensorDictModuleBase):
@@ -141,17 +123,13 @@ class Calling(nn.Module):
         return self.function(x)
 
 
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
+def test_what_cannot_be_exported_is_refused_with_its_reason() -> None:
+    for function, message in (
         (lambda x: squashed(x - x.mean(0)), "acts differently, by .* must depend on the same row"),
         (lambda x: squashed(x) if x.sum() > 0 else squashed(-x), "PyTorch cannot export it: "),
-    ],
-    ids=["batch", "branch"],
-)
-def test_what_cannot_be_exported_is_refused_with_its_reason(function: Callable, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        export_policy(Calling(function), READINGS)
+    ):
+        with pytest.raises(ValueError, match=message):
+            export_policy(Calling(function), READINGS)
 
 
 # Flights
@@ -197,67 +175,73 @@ def test_a_policy_of_three_numbers_declares_its_arrival(tmp_path: Path) -> None:
         evaluate(str(tmp_path / "own.onnx"), "paper-100")
 
 
+def test_no_file_holds_a_path_of_a_machine(own: Path, tmp_path: Path) -> None:
+    """Written: those of other libraries with such metadata, and weights. Shipped: weights, records, results."""
+    model = ModelProto.FromString(own.read_bytes())
+    model.graph.doc_string = str(ROOT)
+    model.graph.node[0].metadata_props.add(key="stack_trace", value=str(ROOT))
+    (tmp_path / "raw.onnx").write_bytes(model.SerializeToString())
+    assert with_paths(tmp_path) == [tmp_path / "raw.onnx"]
+    save_policy(tmp_path / "raw.onnx", tmp_path / "raw.onnx", READINGS)
+    save_policy(tmp_path / "policy.safetensors", FieldPolicy(PolicyConfig(READINGS, (8,))))
+    assert with_paths(tmp_path, ROOT / "magrl", ROOT / "docs" / "results", ROOT / "docs" / "figures") == []
+
+
 # Refusals
 
 
-def refused(model: ModelProto, path: Path, message: str) -> None:
-    path.write_bytes(model.SerializeToString())
-    with pytest.raises(ValueError, match=rf"{re.escape(str(path))} does not hold a valid policy: .*{message}"):
-        load_policy(path)
+def described(change: Callable[[dict], dict]) -> Callable[[ModelProto], None]:
+    """Return a function that changes the description of a policy in its file."""
+
+    def apply(model: ModelProto) -> None:
+        (entry,) = model.metadata_props
+        entry.value = json.dumps(change(json.loads(entry.value)))
+
+    return apply
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("name", "obs", "it must take 'observation' and the memory, and return 'action' and 'next_NAME'"),
-        ("elem_type", TensorProto.DOUBLE, ""),
-        (0, 1, r"'observation' must be float32 \(N, 9\) for any N \(dynamic_axes"),
-    ],
-)
-def test_wrong_names_types_and_sizes_are_refused(own: Path, tmp_path: Path, field, value, message: str) -> None:
-    model = ModelProto.FromString(own.read_bytes())
-    entry = model.graph.input[0]
-    if field == "name":
-        entry.name = model.graph.node[0].input[0] = value
-    elif field == "elem_type":
-        entry.type.tensor_type.elem_type = value
-    else:
-        entry.type.tensor_type.shape.dim[field].dim_value = value
-    refused(model, tmp_path / "changed.onnx", message)
+def renamed(model: ModelProto) -> None:
+    model.graph.input[0].name = model.graph.node[0].input[0] = "obs"
 
 
-def test_a_graph_that_does_not_run_is_refused(own: Path, tmp_path: Path) -> None:
-    model = ModelProto.FromString(own.read_bytes())
-    for number in range(len(model.graph.node)):
-        changed = copy.deepcopy(model)
-        changed.graph.node.pop(number)
-        refused(changed, tmp_path / "changed.onnx", "")
+def of_one_row(model: ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
 
 
-def test_a_wrong_description_is_refused(own: Path, tmp_path: Path) -> None:
-    model = ModelProto.FromString(own.read_bytes())
-    (entry,) = model.metadata_props
-    content = json.loads(entry.value)
-    for change in ({}, content | {"format": 7}, content | {"kind": "map"}, content | {"view": {"max_move_km": -1}}):
-        entry.value = json.dumps(change)
-        refused(model, tmp_path / "changed.onnx", "")
-    del model.metadata_props[:]
-    message = r"state what the network observes by save_policy\('policy.onnx', FILE, view\)"
-    refused(model, tmp_path / "changed.onnx", message)
+def doubled(model: ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
 
 
-def test_a_network_of_another_view_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'observation' must be float32 \(N, 9\) for any N .*got tensor\(float\) .*8"):
-        export_policy(network_file(tmp_path, 8), READINGS)
+def test_damaged_files_are_refused(own: Path, tmp_path: Path) -> None:
+    """Also without one of the four nodes of the graph."""
+    for change, message in (
+        (renamed, "it must take 'observation' and the memory, and return 'action' and 'next_NAME'"),
+        (of_one_row, r"'observation' must be float32 \(N, 9\) for any N \(dynamic_axes"),
+        (doubled, ""),
+        *((lambda model, number=number: model.graph.node.pop(number), "") for number in range(4)),
+        (described(lambda _: {}), ""),
+        (described(lambda content: content | {"format": 7}), ""),
+        (described(lambda content: content | {"kind": "map"}), ""),
+        (described(lambda content: content | {"view": {"max_move_km": -1}}), ""),
+        (lambda model: model.ClearField("metadata_props"), r"by save_policy\('policy.onnx', FILE, view\)"),
+    ):
+        model, path = ModelProto.FromString(own.read_bytes()), tmp_path / "changed.onnx"
+        change(model)
+        path.write_bytes(model.SerializeToString())
+        with pytest.raises(ValueError, match=rf"{re.escape(str(path))} does not hold a valid policy: .*{message}"):
+            load_policy(path)
 
 
 def test_wrong_arguments_are_refused(own: Path, tmp_path: Path, monkeypatch) -> None:
-    with pytest.raises(TypeError, match=r"is saved with what it observes: save_policy\('policy.onnx', network, view\)"):
-        save_policy(tmp_path / "other.onnx", nn.Linear(9, 2))
-    with pytest.raises(ValueError, match=r"an exported network ends with \.onnx, .*got '.*policy.safetensors'"):
-        save_policy(tmp_path / "policy.safetensors", load_policy(own))
-    with pytest.raises(ValueError, match=r"keys must be some of field, target_field, .*got \['position'\]"):
-        ReadingView(keys=["position"], **LIMITS)
+    (tmp_path / "small").mkdir()
+    for call, error, message in (
+        (lambda: export_policy(network_file(tmp_path / "small", 8), READINGS), ValueError, "got tensor.float. .*8"),
+        (lambda: save_policy(tmp_path / "a.onnx", nn.Linear(9, 2)), TypeError, r"save_policy\('policy.onnx', network,"),
+        (lambda: save_policy(tmp_path / "a.pt", load_policy(own)), ValueError, r"ends with \.onnx, .*got '.*a\.pt'"),
+        (lambda: ReadingView(keys=["position"], **LIMITS), ValueError, r"keys must be some of .*got \['position'\]"),
+    ):
+        with pytest.raises(error, match=message):
+            call()
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ImportError, match=r"the package onnx: pip install 'magrl\[onnx\]'"):
         save_policy(tmp_path / "other.onnx", own, READINGS)

@@ -8,11 +8,10 @@ import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
+from magrl import GeomagneticNavEnv, ObservationView, Scenario
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.evaluation.navigators import training_settings
 from magrl.files import load_tensors, save_tensors
-from magrl.transforms import ObservationView
 
 CELLS = (16, 16)
 
@@ -50,23 +49,23 @@ def test_a_policy_is_of_its_region(env, policy) -> None:
 # Files
 
 
-@pytest.mark.parametrize("layer_norm", [True, False])
-def test_save_and_load_give_the_same_actions(env, tmp_path: Path, layer_norm: bool) -> None:
-    policy = FieldPolicy(PolicyConfig(env.observation_view(), CELLS, layer_norm))
-    save_policy(tmp_path / "policy.pt", policy)
-    loaded = load_policy(tmp_path / "policy.pt")
-    assert loaded.config == policy.config
-    for state in env.rollout(3).unbind(1):
-        assert torch.equal(loaded(state.clone())["action"], policy(state.clone())["action"])
+def test_save_and_load_give_the_same_actions(env, tmp_path: Path) -> None:
+    states = env.rollout(3).unbind(1)
+    for layer_norm in (True, False):
+        policy = FieldPolicy(PolicyConfig(env.observation_view(), CELLS, layer_norm))
+        save_policy(tmp_path / "policy.pt", policy)
+        loaded = load_policy(tmp_path / "policy.pt")
+        assert loaded.config == policy.config
+        assert all(torch.equal(loaded(state.clone())["action"], policy(state.clone())["action"]) for state in states)
 
 
 def config(**change) -> Callable:
     return lambda content: content | {"config": content["config"] | change}
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_damaged_policy_is_refused(policy, tmp_path: Path) -> None:
+    path = tmp_path / "policy.pt"
+    for change, message in (
         (
             lambda c: c | {"format": [1] * 10**5},
             r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 4: train it again",
@@ -76,34 +75,29 @@ def config(**change) -> Callable:
         (config(num_cells=(8, 8)), "size mismatch for .*weight"),
         (config(view={}), "does not hold a valid policy"),
         (lambda c: c | {"weights": {k: v * math.nan for k, v in c["weights"].items()}}, "is not finite"),
-    ],
-)
-def test_damaged_policy_is_refused(policy, tmp_path: Path, change, message: str) -> None:
-    path = tmp_path / "policy.pt"
+    ):
+        save_policy(path, policy)
+        save_tensors(change(load_tensors(path)), path)
+        with pytest.raises(ValueError, match=message) as error:
+            load_policy(path)
+        assert str(path) in str(error.value)
+
+
+def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
     save_policy(path, policy)
-    save_tensors(change(load_tensors(path)), path)
-    with pytest.raises(ValueError, match=message) as error:
-        load_policy(path)
-    assert str(path) in str(error.value)
-
-
-@pytest.mark.parametrize("read", [load_policy, lambda path: training_settings([f"td3={path}"])], ids=["policy", "run"])
-@pytest.mark.parametrize(
-    ("training", "message"),
-    [
+    content = load_tensors(path)
+    for training, message in (
         ({"noise": [0.0, -1.0, 0.0]}, "noise.1 must be greater than or equal to 0, got -1"),
         ({"noise": [0.0, 1e308, 0.0]}, "noise must be below"),
         ({"zeta": math.nan}, "zeta must be a finite number, got nan"),
         ({"start_heading": "\x1b[2J"}, r"start_heading must be .*, got '\\x1b\[2J'"),
-    ],
-)
-def test_settings_of_a_training_are_checked(policy, tmp_path: Path, read: Callable, training, message: str) -> None:
-    path = tmp_path / "policy.safetensors"
-    save_policy(path, policy)
-    save_tensors(load_tensors(path) | {"training": training}, path)
-    with pytest.raises(ValueError, match=message) as error:
-        read(path)
-    assert str(path) in str(error.value)
+    ):
+        save_tensors(content | {"training": training}, path)
+        for read in (load_policy, lambda path: training_settings([f"td3={path}"])):
+            with pytest.raises(ValueError, match=message) as error:
+                read(path)
+            assert str(path) in str(error.value)
 
 
 def test_missing_policy_and_foreign_file(tmp_path: Path) -> None:

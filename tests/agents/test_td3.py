@@ -15,7 +15,7 @@ CELLS = (16, 16)
 
 def make_loss(size: int = 13, *, policy_noise: float = 0.1) -> TD3Loss:
     actor, critic = make_actor(size, CELLS), make_critic(size, CELLS)
-    return updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=2.0))
+    return updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=1.2))
 
 
 def updated(loss: StockTD3Loss) -> StockTD3Loss:
@@ -36,22 +36,10 @@ def transitions(size: int = 13, count: int = 32) -> TensorDict:
     )
 
 
-def test_target_policy_smoothing_is_clipped() -> None:
-    """With a large noise of a small clip, the target is that of the smallest and largest clipped noise."""
-    torch.manual_seed(0)
-    actor, critic, batch = make_actor(13, CELLS), make_critic(13, CELLS), transitions()
-    exact = updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=0.0, noise_clip=0.5))
-    near = updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=100.0, noise_clip=1e-4))
-    near.load_state_dict(exact.state_dict())
-    target, noisy = (loss.value_loss(batch.clone())[1]["target_value"] for loss in (exact, near))
-    assert not torch.equal(target, noisy)
-    torch.testing.assert_close(target, noisy, rtol=0, atol=1e-3)
-
-
 def test_loss_is_that_of_torchrl() -> None:
     """Values and gradients of both losses, to rounding, after updates of weights and targets.
 
-    The noise is so large that it takes the action of the target actor out of its bounds, where it is clamped.
+    The noise is so large that it is clipped, and takes the action of the target actor out of its bounds.
     """
     torch.manual_seed(0)
     ours = make_loss(policy_noise=1.0)
@@ -61,7 +49,7 @@ def test_loss_is_that_of_torchrl() -> None:
         batch = transitions()
         optimize(ours.value_loss(batch)[0] + ours.actor_loss(batch)[0], optimizer)
         update.step()
-    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 1.0, "noise_clip": 2.0}
+    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 1.0, "noise_clip": 1.2}
     stock = updated(StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec))
     stock.make_value_estimator(gamma=0.9)
     stock.load_state_dict(ours.state_dict())
@@ -111,11 +99,6 @@ def test_soft_update_moves_the_targets_by_tau() -> None:
     update.step()
     for key, target in loss.target_qvalue_network_params.items(True, True):
         torch.testing.assert_close(target, before[key] + 0.25)
-    batch = transitions()
-    seen = loss.networks.target_critics[0](torch.cat((batch["observation"], batch["action"]), -1))
-    with loss.target_qvalue_network_params[0].to_module(loss.qvalue_network):
-        expected = loss.qvalue_network(batch)["state_action_value"]
-    torch.testing.assert_close(seen, expected)
 
 
 def test_optimize_clips_the_gradient_of_some_parameters() -> None:
@@ -136,17 +119,15 @@ def test_a_step_limit_may_count_as_the_end() -> None:
     assert torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
 
 
-@pytest.mark.parametrize("change", [{"gamma": 1.5}, {"policy_noise": -1.0}, {"noise_clip": math.nan}], ids=str)
-def test_bad_options_of_the_loss_are_refused(change: dict) -> None:
-    options = {"gamma": 0.9, "policy_noise": 0.1, "noise_clip": 0.5} | change
-    with pytest.raises(ValueError, match=next(iter(change))):
-        TD3Loss(make_actor(3, (4,)), make_critic(3, (4,)), **options)
-
-
-def test_networks_of_another_kind_are_refused() -> None:
-    for networks, message in (
-        ((None, make_critic(3, (4,))), "actor must be"),
-        ((make_actor(3, (4,)), None), "critic must be"),
+def test_bad_options_of_the_loss_are_refused() -> None:
+    good = {"actor": make_actor(3, (4,)), "critic": make_critic(3, (4,)), "gamma": 0.9}
+    good |= {"policy_noise": 0.1, "noise_clip": 0.5}
+    for name, value, message in (
+        ("gamma", 1.5, "gamma"),
+        ("policy_noise", -1.0, "policy_noise"),
+        ("noise_clip", math.nan, "noise_clip"),
+        ("actor", None, "actor must be"),
+        ("critic", None, "critic must be"),
     ):
-        with pytest.raises(TypeError, match=message):
-            TD3Loss(*networks, gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        with pytest.raises((TypeError, ValueError), match=message):
+            TD3Loss(**good | {name: value})

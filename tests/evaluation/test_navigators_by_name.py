@@ -7,9 +7,8 @@ import torch
 from support.networks import network_file
 from torchrl.envs import StepCounter, TransformedEnv
 
+from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.envs import GeomagneticNavEnv, Region, Scenario
-from magrl.evaluation import evaluate
 from magrl.evaluation.figures import NAVIGATOR_COLORS
 from magrl.evaluation.navigators import (
     NAVIGATOR_NAMES,
@@ -36,13 +35,20 @@ def env() -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=2, seed=0, max_move_km=30.0)
 
 
+def trained(env: GeomagneticNavEnv, folder: Path, **settings: object) -> Path:
+    """Return the folder of a policy that has learned nothing, whose file holds settings of its training."""
+    policy = FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False))
+    policy.training = {"guided": True, "scenario": None, "zeta": 0.01, "noise": (0.0, 0.0, 0.0)} | settings
+    folder.mkdir()
+    save_policy(folder / "policy.safetensors", policy)
+    if settings.get("scenario"):
+        (folder / "scenario.toml").write_text("date = 2026-07-01", encoding="utf-8")
+    return folder
+
+
 @pytest.fixture(scope="module")
 def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run whose agent has learned nothing."""
-    folder = tmp_path_factory.mktemp("run")
-    config = PolicyConfig(env.observation_view(), (8,), layer_norm=False)
-    save_policy(folder / "policy.safetensors", FieldPolicy(config))
-    return folder
+    return trained(env, tmp_path_factory.mktemp("runs") / "run")
 
 
 def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv, run: Path) -> None:
@@ -53,12 +59,6 @@ def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv
         assert navigator(env.reset())["action"].shape == (2, 2)
         assert NAVIGATOR_NAMES[name] in label(name)
         assert needs(name) == getattr(navigator, "needs", needs(name))
-
-
-def test_unknown_names_have_no_label() -> None:
-    for function in (label, needs, trained_on):
-        with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
-            function("dowsing")
 
 
 def test_navigators_are_made_for_their_environment_and_sensors(env: GeomagneticNavEnv) -> None:
@@ -88,6 +88,9 @@ def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_pat
             ValueError, match=f"unknown navigator '{text}': choose from gg_td3=RUN, .*anywhere=RUN, .*kalman, anywhere"
         ):
             make_navigator(text, env)
+    for function in (label, needs, trained_on):
+        with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
+            function("dowsing")
     for text, error, message in (
         ("gg_td3", ValueError, "gg_td3 needs the folder of a finished run: gg_td3=RUN"),
         ("policy:SAC", ValueError, "policy needs the folder of a finished run or the file of a policy"),
@@ -105,14 +108,13 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
     agents = [make_navigator("anywhere", env, step_price=price) for price in (0.1, 3.0)]
     assert [agent.rules.step_price for agent in agents] == [0.1, 3.0]
     assert agents[0].rules.max_steps == 80
-    first, second = (agent(env.reset())["action"] for agent in agents)
-    assert not torch.equal(first, second)
+    assert not torch.equal(*(agent(env.reset())["action"] for agent in agents))
 
 
 @pytest.mark.parametrize("limits", [{"max_move_km": 20, "max_steps": 120}, {"max_turn_deg": 20}])
 def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limits: dict[str, int]) -> None:
-    episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 12), start_heading="random", **limits)
-    assert episodes["success"].double().mean() >= 0.99
+    episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 3), start_heading="random", **limits)
+    assert episodes["success"].all()
     assert episodes["spl"].mean() > 0.98
 
 
@@ -125,17 +127,6 @@ def test_navigators_that_are_given_twice(run: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             check_distinct(texts)
-
-
-def trained(env: GeomagneticNavEnv, folder: Path, **settings: object) -> Path:
-    """Return the folder of a policy whose file holds settings of its training."""
-    policy = FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False))
-    policy.training = {"guided": True, "scenario": None, "zeta": 0.01, "noise": (0.0, 0.0, 0.0)} | settings
-    folder.mkdir()
-    save_policy(folder / "policy.safetensors", policy)
-    if settings.get("scenario"):
-        (folder / "scenario.toml").write_text("date = 2026-07-01", encoding="utf-8")
-    return folder
 
 
 def test_settings_of_a_training_are_read_from_the_file_of_the_policy(env: GeomagneticNavEnv, tmp_path: Path) -> None:

@@ -25,9 +25,8 @@ def place(*degrees: float) -> torch.Tensor:
     return torch.tensor(degrees, dtype=torch.float64)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
+def test_coordinates() -> None:
+    for text, expected in (
         ("60.4N 5.3E", (60.4, 5.3)),
         ("60.4, 5.3", (60.4, 5.3)),
         ("-33.9 18.4", (-33.9, 18.4)),
@@ -37,29 +36,16 @@ def place(*degrees: float) -> torch.Tensor:
         ("58°58'N 5°44'E", (58 + 58 / 60, 5 + 44 / 60)),
         ("-33° 54′ 36″, 18°25.5'W", (-33.91, -18.425)),
         ("1N,181E", (1, -179)),
-    ],
-)
-def test_coordinates(text: str, expected: tuple[float, float]) -> None:
-    assert parse_coordinates(text).tolist() == pytest.approx(expected, abs=1e-12)
+    ):
+        assert parse_coordinates(text).tolist() == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["Bergen", "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°60'N 5°44'E"],
-)
-def test_coordinates_that_are_none(text: str) -> None:
-    with pytest.raises(ValueError, match=r"must (be|have)"):
-        parse_coordinates(text)
-
-
-def test_long_texts_are_no_coordinates() -> None:
-    """They took minutes: the time of the expression grew with powers of the length."""
-    for text in ("1" * 30_000 + "x", "1" + " " * 30_000 + "x", "1'" * 15_000):
-        with pytest.raises(ValueError, match=r"a place must be written such as .{30,150}$"):
+def test_texts_that_are_no_place() -> None:
+    """Long ones took minutes: the time of the expression grew with powers of the length."""
+    wrong = "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°60'N 5°44'E"
+    for text in ("Bergen", *wrong, "1" * 30_000 + "x", "1" + " " * 30_000 + "x", "1'" * 15_000):
+        with pytest.raises(ValueError, match=r"(must have|must be) .{10,150}$"):
             parse_coordinates(text)
-
-
-def test_elements_that_no_field_has() -> None:
     assert parse_elements("60.4N 5.3E") is None
     for text in ("D=181 I=0 BH=1", "D=0 I=91 BH=1", "D=0 I=0 BH=0"):
         with pytest.raises(ValueError, match=f"got '{text}'"):

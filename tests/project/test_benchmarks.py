@@ -61,13 +61,8 @@ def test_results_are_written(monkeypatch, tmp_path, capsys) -> None:
 
 
 def test_timed_functions_run() -> None:
-    base = env.with_every_sensor_error(env.GeomagneticNavEnv(num_envs=4, seed=0))
-    for timed in (
-        env.Collecting(4),
-        env.Stepper(env.GeomagneticNavEnv(num_envs=4, seed=0)),
-        env.Running(base, begun=2),
-    ):
-        timed()
+    base, plain = (env.GeomagneticNavEnv(num_envs=4, seed=0) for _ in range(2))
+    for timed in (env.Collecting(4), env.Stepper(plain), env.Running(env.with_every_sensor_error(base), begun=2)):
         assert env.time_of(timed, 0.0) > 0
     stock = update.Stock(update.OBSERVATION_SIZE)
     before = [weights.clone() for weights in stock.loss.parameters()]

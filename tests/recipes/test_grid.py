@@ -11,10 +11,9 @@ from PIL import Image
 from support.recipes import RECIPES
 from tensordict import TensorDict
 
-from magrl import benchmark
+from magrl import IGRF, Scenario, Tasks, benchmark
 from magrl.benchmark import COLUMNS, LEVELS, read_episodes
 from magrl.training import UsageError
-from magrl.transforms import CONDITIONS
 
 sys.path.insert(0, str(RECIPES / "tables"))
 import figures
@@ -43,47 +42,41 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
             assert not figures.one_error(error["lines"], size).perfect
 
 
-@pytest.mark.parametrize(
-    ("tables", "changes", "message"),
-    [
+def test_bad_usage(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for tables, changes, message in (
         (("mars",), {}, "declares no table mars: choose from"),
         (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
         (("comparison",), {"navigators": ("secant",), "jobs": 2}, "comparison: .* unexpected keyword argument 'jobs'"),
         (("noise",), {}, "there is no runs/.*: train it by make tables"),
-    ],
-)
-def test_bad_usage(tables, changes: dict, message: str, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError, match=message):
-        grid.make(tables, **changes)
-    with pytest.raises(UsageError, match="unknown figure"):
-        figures.draw(("mars",))
-    with pytest.raises(UsageError, match="No such file"):
-        figures.draw(("section-4",))
-    with pytest.raises(UsageError, match=r"there is no runs/.*seed"):
-        figures.draw(("learning",))
+    ):
+        with pytest.raises(UsageError, match=message):
+            grid.make(tables, **changes)
+    for figure, message in (("mars", "unknown figure"), ("section-4", "No such file"), ("learning-return", "no runs/")):
+        with pytest.raises(UsageError, match=message):
+            figures.draw((figure,))
 
 
 def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
     page, other = tmp_path / "page.md", tmp_path / "other.md"
-    (tmp_path / "a.md").write_text("| 1 |\n", encoding="utf-8")
-    page.write_text("x\n<!-- table: a.md -->\nold\n<!-- end -->\ny", encoding="utf-8")
+    (tmp_path / "a.md").write_text("| a | b |\n|---|---|\n| 1 | 2 |\n", encoding="utf-8")
+    page.write_text("x\n<!-- table: a.md | b -->\nold\n<!-- end -->\ny", encoding="utf-8")
     other.write_text("<!-- table: b.md -->\n<!-- end -->", encoding="utf-8")
     with pytest.raises(UsageError, match=r"No such file .*b\.md"):
         publish.publish((page, other), tmp_path)
     assert "old" in page.read_text(encoding="utf-8")
     publish.publish((page,), tmp_path)
-    assert page.read_text(encoding="utf-8") == "x\n<!-- table: a.md -->\n\n| 1 |\n\n<!-- end -->\ny"
+    text = "x\n<!-- table: a.md | b -->\n\n| b |\n|---|\n| 2 |\n\n<!-- end -->\ny"
+    assert page.read_text(encoding="utf-8") == text
 
 
-def test_a_document_may_show_some_columns(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    (tmp_path / "a.md").write_text("| name | SPL % | steps |\n|---|---|---|\n| secant | 99.0 | 8 |\n", encoding="utf-8")
-    page.write_text("<!-- table: a.md | steps | name -->\n<!-- end -->", encoding="utf-8")
-    publish.publish((page,), tmp_path)
-    assert page.read_text(encoding="utf-8").splitlines()[2:5] == ["| steps | name |", "|---|---|", "| 8 | secant |"]
-    with pytest.raises(UsageError, match="no column SR %: choose from name, SPL %, steps"):
-        publish.selected("| name | SPL % | steps |", "SR %")
+def test_a_document_may_show_some_columns_and_rows() -> None:
+    table = "| name | SPL % |\n|---|---|\n| secant | 99.0 |\n| kalman | 98.0 |\n| geodesic | 100.0 |"
+    shown = publish.selected(table, "SPL % | name = kalman or geodesic").splitlines()
+    assert shown == ["| SPL % | name |", "|---|---|", "| 98.0 | kalman |", "| 100.0 | geodesic |"]
+    for columns, message in (("SR %", "no column SR %: choose from name, SPL %"), ("name = mars or x", "no row mars")):
+        with pytest.raises(UsageError, match=message):
+            publish.selected(table, columns)
 
 
 # Flights
@@ -97,24 +90,32 @@ def few_regions(monkeypatch) -> None:
     )
 
 
-def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(benchmark.TRACKS, "vehicles-v2", replace(benchmark.TRACKS["vehicles-v2"], max_steps=20))
+NEAR = {"tasks": 4, "distance_km": (100, 150), "max_steps": 4}
+"""Tasks of three legs."""
+
+
+def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
     oracle, old = "geodesic", {"name": "kalman", "step_price": 30.0}
-    table = rows(
-        grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=4, max_steps=12).text
-    )
+    table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], **NEAR).text)
     assert table[0] == ["navigator", "trained on", "given", "0, 0, 0", "0.5, 0.1, 20"]
     assert table[2][3] == "100.0 / 100.0"
     assert table[3][0] == "Kalman (dual control), step price 30.0"
     assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
     assert table[4][3].strip("*").startswith("+")
-    assert rows(grid.flights([oracle], tasks=2, max_steps=1).text)[2][3] == "0.0 / 0.0"
-    far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60).text)
+    options = {"levels": [(0, 0, 0)], "tasks": 2}
+    assert rows(grid.flights([oracle], **options, max_steps=1).text)[2][3] == "0.0 / 0.0"
+    far = rows(grid.flights([oracle], **options, distance_km=(1200, 1300), max_steps=30).text)
     assert far[2][3] == "100.0 / 100.0"
-    grid.make(("confidence",), navigators=(oracle,), tasks=2, confidence=0.0, out=tmp_path / "new")
-    head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
-    assert head == ["navigator", "trained on", "given", "aircraft", "ship", "underwater", "low-cost"]
-    assert row[3] == "100.0 / 0.0"
+
+
+def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, monkeypatch) -> None:
+    few = replace(benchmark.TRACKS["vehicles-v2"], **NEAR, conditions=["ship"])
+    monkeypatch.setitem(benchmark.TRACKS, "vehicles-v2", few)
+    for confidence, ends in ((0.0, "100.0 / 0.0"), (1.0, "0.0 / 0.0")):
+        grid.make(("confidence",), navigators=("geodesic",), tasks=2, confidence=confidence, out=tmp_path / "new")
+        head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
+        assert head == ["navigator", "trained on", "given", "ship"]
+        assert row[3] == ends
 
 
 def test_a_column_says_whether_the_destination_was_measured(monkeypatch) -> None:
@@ -133,44 +134,31 @@ def test_a_column_says_whether_the_destination_was_measured(monkeypatch) -> None
 
 
 def test_differences_are_of_correct_arrivals_where_cells_are() -> None:
-    options = {"tasks": 2, "within_km": 25, "max_steps": 12, "levels": [(0, 0, 0)], "against": ["secant"]}
+    """Of vehicles that declare with any confidence, all are right or wrong."""
+    options = {**NEAR, "within_km": 25, "conditions": ["ship"], "against": ["secant"]}
     measures = ("success_rate", "false_arrival_rate")
     table = rows(grid.flights(["geodesic", "secant"], measures=measures, **options).text)
     assert table[4][0].endswith("secant (quasi-Newton), correct arrivals")
-    difference = float(table[2][3].split(" / ")[0]) - float(table[3][3].split(" / ")[0])
-    assert float(table[4][3].strip("*").split(" ")[0]) == difference
+    shares = [[float(share) for share in row[3].split(" / ")] for row in table[2:4]]
+    assert float(table[4][3].strip("*").split(" ")[0]) == shares[0][0] - shares[1][0]
+    assert [sum(row) for row in shares] == [100, 100]
+    assert shares[0] != shares[1]
 
 
 def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(benchmark.TRACKS, "north-v1", replace(benchmark.TRACKS["north-v1"], max_steps=14))
+    few = replace(benchmark.TRACKS["north-v1"], **NEAR, levels=[(0, 0, 0), (0.05, 0.05, 5.0)])
+    monkeypatch.setitem(benchmark.TRACKS, "north-v1", few)
     grid.make(("north-declared",), navigators=("secant", "geodesic"), tasks=3, out=tmp_path)
-    table, episodes = (
-        rows((tmp_path / "north-declared.md").read_text(encoding="utf-8")),
-        read_episodes(tmp_path / "north-declared.csv.gz"),
-    )
+    table = rows((tmp_path / "north-declared.md").read_text(encoding="utf-8"))
+    episodes = read_episodes(tmp_path / "north-declared.csv.gz")
     assert set(episodes["track"]) == {"north-v1"}
-    assert episodes["task"].tolist() == 6 * [0, 1, 2]
+    assert episodes["task"].tolist() == 4 * [0, 1, 2]
     ends = episodes.groupby(["navigator", "level"])[["success", "spl"]].mean() * 100
     for name, _, _, *cells in table[2:4]:
         for level, cell in zip(table[0][3:], cells, strict=True):
             assert cell == "{:.1f} / {:.1f}".format(*ends.loc[(name, level)])
     assert episodes["final_distance_km"].between(0, 25)[episodes["success"]].all()
-    assert 0 < episodes["success"].sum() < 18
-
-
-def test_vehicles_that_declare_are_right_or_wrong() -> None:
-    options = {"conditions": ["ship"], "tasks": 4, "within_km": 25, "max_steps": 20}
-    assert rows(grid.flights(["secant"], confidence=1.0, **options).text)[2][3] == "0.0 / 0.0"
-    bold = flights.Flights(**options).summaries("secant", CONDITIONS["ship"])[0]
-    assert 0 < bold["spl"] < bold["success_rate"] == 100 - bold["false_arrival_rate"]
-
-
-def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:
-    table = rows(grid.flights(["geodesic"], box=True, tasks=3, levels=[(0, 0, 0)]).text)
-    assert table[2][3] == "100.0 / 100.0"
-    scenario = flights.Flights(box=True, tasks=3).scenario
-    assert scenario.start_heading == "north"
-    assert scenario.tasks.start.tolist() == benchmark.named_tasks("test-1000").start[:3].tolist()
+    assert 0 < episodes["success"].sum() < 12
 
 
 def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from magrl.training import UsageError
 
 minari = pytest.importorskip("minari")
 recipe = load("../docs/examples/offline_dataset")
-SMALL = ["--regions", "2", "--episodes", "6", "--distance-range-km", "60", "90", "--max-steps", "9", "--seed", "1"]
+SMALL = ["--regions", "2", "--episodes", "6", "--distance-range-km", "60", "90", "--max-steps", "6", "--seed", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -56,17 +56,16 @@ def test_torchrl_loads_them_from_disk(tmp_path: Path, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("noise", ["0", "0_05", "0_5"])
-def test_the_environment_in_the_metadata_repeats_them(noise: str) -> None:
-    data = minari.load_dataset(f"magrl/earth-secant-{noise}-v0")
+def test_the_environment_in_the_metadata_repeats_them() -> None:
+    data = minari.load_dataset("magrl/earth-secant-0_05-v0")
     metadata, episodes = data.storage.metadata, list(data.iterate_episodes())
     assert metadata["command"] == "python docs/examples/offline_dataset.py --field earth " + (
-        "--episodes 6 --regions 2 --distance-range-km 60.0 90.0 --max-steps 9 --seed 1"
+        "--episodes 6 --regions 2 --distance-range-km 60.0 90.0 --max-steps 6 --seed 1"
     )
     envs = eval(metadata["environment"], {"gymnasium": gymnasium, "magrl": magrl})
     assert envs.single_observation_space == data.observation_space
     state, _ = envs.reset(seed=next(iter(data.storage.get_episode_metadata([0])))["seed"])
-    for step in range(9):
+    for step in range(6):
         running = [row for row, episode in enumerate(episodes) if step < len(episode)]
         actions = np.zeros((6, 2), dtype=np.float32)
         for row in running:

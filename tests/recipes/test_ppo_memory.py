@@ -10,8 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs.utils import check_env_specs
 
-from magrl.agents import load_policy, save_policy
-from magrl.envs import planet_scenario
+from magrl import load_policy, planet_scenario, save_policy
 from magrl.navigators.memory import Memory, MemoryNetwork
 from magrl.tracking.network import pretrained
 from magrl.transforms.sequences import READING_SIZE
@@ -19,9 +18,8 @@ from magrl.transforms.sequences import READING_SIZE
 CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=8)
 
 
-def training_env(task: str = "storm"):
-    planets = planet_scenario(8, seed=3, **CONFIG.regions)
-    return recipe.make_env(planets, CONFIG.replace(task=task, seed=5))
+def training_env():
+    return recipe.make_env(planet_scenario(8, seed=3, **CONFIG.regions), CONFIG.replace(task="storm", seed=5))
 
 
 def network() -> MemoryNetwork:
@@ -33,9 +31,8 @@ def network() -> MemoryNetwork:
     return made
 
 
-@pytest.mark.parametrize("task", ["storm", "readings"])
-def test_specs_of_the_training_environment(task: str) -> None:
-    env = training_env(task)
+def test_specs_of_the_training_environment() -> None:
+    env = training_env()
     check_env_specs(env, break_when_any_done="both")
     assert env.observation_spec["observation"].shape == (6, READING_SIZE)
     assert recipe.JUDGED == ("observation", "true_way_scaled", "highest_spl")
@@ -47,9 +44,9 @@ def test_an_agent_acts_as_it_was_trained() -> None:
     mean = TensorDictModule(recipe.Joined(trained.correct), list(recipe.KNOWN), ["correction"])
     leg = TensorDictModule(recipe.Leg(), ["estimate", "correction", "heading"], ["action"])
     env = training_env()
-    moves = env.rollout(6, TensorDictSequential(recipe.make_memory(trained), mean, leg), break_when_any_done=False)
+    moves = env.rollout(4, TensorDictSequential(recipe.make_memory(trained), mean, leg), break_when_any_done=False)
     plain = recipe.task_env(env.base_env.scenario, CONFIG, num_envs=6, seed=5, observation="dict", scale_actions=False)
-    flown = plain.rollout(6, Memory(trained), break_when_any_done=False)
+    flown = plain.rollout(4, Memory(trained), break_when_any_done=False)
     assert moves["action"].std() > 0.1
     torch.testing.assert_close(flown["next", "field"], moves["next", "field"], rtol=1e-4, atol=1e-2)
     torch.testing.assert_close(flown["next", "move"], moves["next", "move"], rtol=1e-4, atol=1e-2)
@@ -95,18 +92,11 @@ def test_a_training_writes_its_agent(tmp_path) -> None:
         assert all(weight.any() for weight in part[-1].parameters())
 
 
-def test_errors_are_those_of_the_task() -> None:
-    with pytest.raises(ValueError, match=r"noise and drift are the task's, got \(0\.1, 0\.0, 0\.0\)"):
-        recipe.Config(noise=(0.1, 0.0, 0.0))
-
-
 def test_a_file_of_an_agent_holds_its_network_and_no_other(tmp_path) -> None:
     saved = network()
     save_policy(tmp_path / "memory.safetensors", Memory(saved))
-    for weight, found in zip(
-        saved.parameters(), Memory(tmp_path / "memory.safetensors").network.parameters(), strict=True
-    ):
-        assert torch.equal(weight, found)
+    found = Memory(tmp_path / "memory.safetensors").network.state_dict()
+    assert all(torch.equal(weight, found[name]) for name, weight in saved.state_dict().items())
     with pytest.raises(ValueError, match=r"anywhere\.safetensors does not hold a valid memory"):
         Memory(pretrained("anywhere"))
     with torch.no_grad():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import replay_log as recipe
 import torch
+from matplotlib.figure import Figure
 
 from magrl.field import IGRF, elements_at
 from magrl.training import UsageError
@@ -23,7 +25,7 @@ def test_the_example_is_what_its_command_writes(tmp_path: Path) -> None:
     assert (tmp_path / "log.csv").read_text(encoding="utf-8") == LOG.read_text(encoding="utf-8")
 
 
-def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
+def test_the_example_with_other_columns(tmp_path: Path, monkeypatch, capsys) -> None:
     """The estimate comes near the truth, the stated error holds, and no position enters: without them, the same."""
     recipe.main([str(LOG), *NOISE, "--out", str(tmp_path / "a")])
     table = pd.read_csv(tmp_path / "a" / "log.csv")
@@ -35,6 +37,7 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     assert (tmp_path / "a" / "log.md").read_text(encoding="utf-8") in said
     assert "Error of the estimated displacement at the end" in said
     assert (tmp_path / "a" / "log.png").stat().st_size > 10_000
+    monkeypatch.setattr(recipe, "figure", lambda *_: Figure())
     blind = pd.read_csv(LOG).drop(columns=["time", "latitude", "longitude"]).rename(columns={"D": "dec"})
     blind.to_csv(tmp_path / "blind.csv", index=False)
     recipe.main([str(tmp_path / "blind.csv"), *NOISE, "--declination", "dec", "--out", str(tmp_path / "b")])
@@ -44,19 +47,32 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     pd.testing.assert_frame_equal(table[columns], other[columns])
 
 
-def test_the_first_position_may_be_known(tmp_path: Path) -> None:
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch, capsys) -> Callable[..., str]:
+    """Return a function that replays a log with options, without its figure, into a folder; it returns the text."""
+    monkeypatch.setattr(recipe, "figure", lambda *_: Figure())
+
+    def run(log: pd.DataFrame, *options: object) -> str:
+        log.to_csv(tmp_path / "log.csv", index=False)
+        recipe.main([str(tmp_path / "log.csv"), *NOISE, *map(str, options), "--out", str(tmp_path / "out")])
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_the_first_position_may_be_known(tmp_path: Path, said) -> None:
     """The way to the last position, or to another one, is then known from the first row on."""
-    log, date, path = pd.read_csv(LOG)[:12], ["--date", "2025-01-01"], tmp_path / "log.csv"
-    log.to_csv(path, index=False)
-    for options in ([], ["--target-position", "62.5", "1.0"]):
-        recipe.main([str(path), *NOISE, *date, "--start-km", "0.5", *options, "--out", str(tmp_path / "out")])
+    log, start, date = pd.read_csv(LOG)[:6], ("--start-km", 0.5), ("--date", "2025-01-01")
+    for options in ((), ("--target-position", 62.5, 1.0)):
+        said(log, *start, *date, *options)
         assert pd.read_csv(tmp_path / "out" / "log.csv")["miss_km"].max() < 3
-    log.drop(columns=["latitude", "longitude"]).to_csv(tmp_path / "blind.csv", index=False)
-    for path, more in ((LOG, []), (tmp_path / "blind.csv", date)):
-        with pytest.raises(UsageError, match=r"start_km 0\.5 needs positions in the log and a date"):
-            recipe.main([str(path), "--start-km", "0.5", *more, "--out", str(tmp_path / "out")])
-    with pytest.raises(UsageError, match="model 'WMM' must be IGRF-13, IGRF-14"):
-        recipe.main([str(LOG), "--start-km", "0.5", *date, "--model", "WMM", "--out", str(tmp_path / "out")])
+    for changed, options, message in (
+        (log, (), r"start_km 0\.5 needs positions in the log and a date"),
+        (log.drop(columns=["latitude", "longitude"]), date, r"start_km 0\.5 needs positions in the log and a date"),
+        (log, (*date, "--model", "WMM"), "model 'WMM' must be IGRF-13, IGRF-14"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            said(changed, *start, *options)
 
 
 def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
@@ -73,19 +89,15 @@ def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(recipe.joined(log, 0.0), log, check_dtype=False)
 
 
-def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Path, capsys) -> None:
-    header, *rows = LOG.read_text(encoding="utf-8").splitlines()[:8]
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]), encoding="utf-8")
-    recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "a")])
-    said = capsys.readouterr().out
-    assert "Warning: 7 rows with the time of the row before left out." in said
-    assert "IGRF" not in said
-    assert "Error of the estimated displacement halfway" in said
-    wrong = pd.read_csv(LOG)[:4]
-    wrong.assign(I=-wrong["I"]).to_csv(path, index=False)
-    recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "b")])
-    assert "4 of 4 readings do not fit IGRF" in capsys.readouterr().out
+def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(said) -> None:
+    log, date = pd.read_csv(LOG)[:4], ("--date", "2025-01-01")
+    text = said(log.loc[log.index.repeat(2)], *date)
+    assert "Warning: 4 rows with the time of the row before left out." in text
+    assert "IGRF" not in text
+    assert "Error of the estimated displacement halfway" in text
+    assert "4 of 4 readings do not fit IGRF" in said(log.assign(I=-log["I"]), *date)
+    log["heading"] = [0, 1, 2, 1]  # no vehicle was to steer so, but no single row is impossible
+    assert "If these are radians, convert them to degrees" in said(log)
 
 
 def test_the_unit_that_ends_a_name_counts(tmp_path: Path) -> None:
@@ -101,27 +113,20 @@ def test_the_unit_that_ends_a_name_counts(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(found, recipe.read_log(recipe.Config(tmp_path / "log.csv")))
 
 
-@pytest.mark.parametrize(("km", "warned"), [(450.0, False), (0.45, True)])
-def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) -> None:
+def test_the_altitude_counts(tmp_path: Path, said) -> None:
     """A log from 450 km fits IGRF there, also the direction of its north; one of 450 m does not."""
-    log = pd.read_csv(LOG)[:4]
-    elements = elements_at(IGRF("2025-01-01", altitude_km=km), torch.tensor(log[["latitude", "longitude"]].to_numpy()))
-    log[["D", "I", "B_H"]] = elements.numpy()
-    log.assign(altitude_km=450.0).to_csv(tmp_path / "log.csv", index=False)
-    options = ["--date", "2025-01-01", "--north", "magnetic", "--out", str(tmp_path / "out")]
-    recipe.main([str(tmp_path / "log.csv"), *NOISE, *options])
-    said = capsys.readouterr().out
-    assert ("do not fit IGRF" in said) == warned
+    log, options = pd.read_csv(LOG)[:4].assign(altitude_km=450.0), ("--date", "2025-01-01", "--north", "magnetic")
+    place = torch.tensor(log[["latitude", "longitude"]].to_numpy())
+    for km, more, warned in ((0.45, (), True), (450.0, ("--altitude", "none"), True), (450.0, (), False)):
+        log[["D", "I", "B_H"]] = elements_at(IGRF("2025-01-01", altitude_km=km), place).numpy()
+        assert ("4 of 4 readings do not fit IGRF" in said(log, *options, *more)) == warned
     table = pd.read_csv(tmp_path / "out" / "log.csv")
-    if not warned:
-        assert table["north_deg"].tolist() == pytest.approx(log["D"].tolist(), abs=1e-4)
-        recipe.main([str(tmp_path / "log.csv"), *NOISE, *options, "--altitude", "none"])
-        assert "4 of 4 readings do not fit IGRF" in capsys.readouterr().out
+    assert table["north_deg"].tolist() == pytest.approx(log["D"].tolist(), abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("change", "arguments", "message"),
-    [
+def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
+    path, lines = tmp_path / "log.csv", "\n".join(LOG.read_text(encoding="utf-8").splitlines()[:5])
+    for change, arguments, message in (
         (("B_H", "H"), (), "is 'B_H': name the column of B_H, one of \\['time', 'D', 'I', 'H'"),
         (("1.310", "x"), (), r"cannot read .*: row 2, D: 'x' is not a number"),
         (("1.310", ""), (), r"cannot read .*: row 2, D: '' is not a number"),
@@ -129,27 +134,12 @@ def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) ->
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
         (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest leg"),
         (("0.83", "20"), (), "time runs backward from row 2 to 3, from 20 to 1.67: sort the rows"),
-        (("", ""), ("--every-km", "5000"), "every_km 5000 leaves one reading of 25: choose shorter legs"),
-        (("", ""), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
-        (("", ""), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
-        (("", ""), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),
+        (("B_H", "B_H"), ("--every-km", "5000"), "every_km 5000 leaves one reading of 4: choose shorter moves"),
+        (("B_H", "B_H"), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
+        (("B_H", "B_H"), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
+        (("B_H", "B_H"), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),
         (("62.06", "162.06"), (), "latitude 162.06.* is not from -90 to 90 deg"),
-    ],
-)
-def test_errors_name_what_is_wrong(tmp_path: Path, change, arguments, message: str) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(
-        LOG.read_text(encoding="utf-8").replace(*change, 1) if change[0] else LOG.read_text(encoding="utf-8"),
-        encoding="utf-8",
-    )
-    with pytest.raises(UsageError, match=message):
-        recipe.main([str(path), *arguments, "--out", str(tmp_path / "out")])
-
-
-def test_headings_that_may_be_radians_are_named(tmp_path: Path, capsys) -> None:
-    """The example with its headings in radians: no vehicle was to steer so, but no single row is impossible."""
-    log = pd.read_csv(LOG)
-    log["heading"] = log["heading"] / 57.29578
-    log.to_csv(tmp_path / "log.csv", index=False)
-    recipe.main([str(tmp_path / "log.csv"), *NOISE, "--out", str(tmp_path / "out")])
-    assert "If these are radians, convert them to degrees" in capsys.readouterr().out
+    ):
+        path.write_text(lines.replace(*change, 1), encoding="utf-8")
+        with pytest.raises(UsageError, match=message):
+            recipe.main([str(path), *arguments, "--out", str(tmp_path / "out")])

@@ -102,17 +102,18 @@ def test_damaged_newest_is_reported_and_the_previous_is_used(saved) -> None:
 
 def test_other_formats_and_other_parts_are_refused_by_name(saved) -> None:
     checkpoints, part = saved
-    newest = checkpoints.files()[-1]
-    with pytest.raises(ValueError, match=r"holds \['part'\], not \['buffer'\]"):
-        Checkpoints(checkpoints.folder, {"buffer": part}).load()
-    with pytest.raises(ValueError, match="part does not fit this training"):
-        Checkpoints(checkpoints.folder, {"part": nn.Linear(1, 1)}).load()
-    save_tensors({"format": 99, "frames": 1, "parts": {}}, newest)
-    with pytest.raises(ValueError, match="of format 99; this version reads 1"):
-        checkpoints.load()
-    save_tensors({"weights": 1}, newest)
+    for parts, content, message in (
+        ({"buffer": part}, None, r"holds \['part'\], not \['buffer'\]"),
+        ({"part": nn.Linear(1, 1)}, None, "part does not fit this training"),
+        ({"part": part}, {"format": 99, "frames": 1, "parts": {}}, "of format 99; this version reads 1"),
+    ):
+        if content:
+            save_tensors(content, checkpoints.files()[-1])
+        with pytest.raises(ValueError, match=message):
+            Checkpoints(checkpoints.folder, parts).load()
+    save_tensors({"weights": 1}, checkpoints.files()[-1])
     with pytest.raises(ValueError, match="is not a checkpoint: it must hold format, frames and parts"):
-        read_checkpoint(newest)
+        read_checkpoint(checkpoints.files()[-1])
 
 
 def test_write_that_fails_leaves_the_others(saved, monkeypatch) -> None:

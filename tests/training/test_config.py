@@ -23,9 +23,9 @@ def parse(*args: str) -> recipe.Config:
     return parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, recipe.__doc__, args)
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
+def test_bad_settings_of_a_run(tmp_path: Path) -> None:
+    """Each alone, and those that do not agree with their scenario."""
+    for bad, message in (
         ({"device": "foo"}, "device 'foo' cannot be used here"),
         ({"scenario": Path("nowhere.toml")}, "there is no scenario file at nowhere.toml"),
         ({"seed": paper.TEST_SEED}, "seed must be less than"),
@@ -33,25 +33,18 @@ def parse(*args: str) -> recipe.Config:
         ({"zeta": 3.0}, "zeta must be below 3, got 3"),
         ({"noise": (0.05, -0.05, 5.0)}, "noise.1 must be greater than or equal to 0, got -0.05"),
         ({"speed": 1}, "unknown key 'speed'"),
-    ],
-    ids=str,
-)
-def test_bad_settings_of_a_run(bad: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        RunConfig(**bad)
-
-
-def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
+    ):
+        with pytest.raises(ValueError, match=message):
+            RunConfig(**bad)
     path = tmp_path / "mine.toml"
-    path.write_text(OWN + "zeta = 0.02\n", encoding="utf-8")
-    with pytest.raises(ValueError, match=r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
-        RunConfig(scenario=path)
-    path.write_text(OWN + 'arrival = "declared"\n', encoding="utf-8")
-    with pytest.raises(ValueError, match="only ppo_anywhere"):
-        RunConfig(scenario=path)
-    path.write_text(OWN.replace("[40, 50]", "[75, 85]"), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"):
-        RunConfig(scenario=path)
+    for text, message in (
+        (OWN + "zeta = 0.02\n", r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"),
+        (OWN + 'arrival = "declared"\n', "only ppo_anywhere"),
+        (OWN.replace("[40, 50]", "[75, 85]"), r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"),
+    ):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match=message):
+            RunConfig(scenario=path)
 
 
 def test_linear_goes_from_start_to_end() -> None:
@@ -81,9 +74,8 @@ def test_every_setting_can_be_given_as_wandb_sweeps_write_it(name: str) -> None:
 MINE = '"recipe": "td3_gradient_guided.py"'
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
+def test_other_files_are_not_resumed(tmp_path: Path) -> None:
+    for content, message in (
         (None, "holds no config.json"),
         ("", "cannot resume"),
         (f'{{{MINE}, "name": 5}}', "name must be a text of printable characters, got 5"),
@@ -97,25 +89,24 @@ MINE = '"recipe": "td3_gradient_guided.py"'
         (f'{{{MINE}, "gamma": 2.0}}', "gamma must be less than 1, got 2.0"),
         (f'{{{MINE}, "scenario": "scenario.toml"}}', "there is no scenario file at"),
         (f'{{{MINE}, "wandb_mode": "loud"}}', "wandb_mode must be 'offline', 'online' or 'disabled'"),
-    ],
-)
-def test_other_files_are_not_resumed(tmp_path: Path, content: str | None, message: str) -> None:
-    if content is not None:
-        (tmp_path / "config.json").write_text(content, encoding="utf-8")
-    with pytest.raises(UsageError, match=message) as error:
-        parse("--resume", str(tmp_path))
-    assert str(tmp_path) in str(error.value)
+    ):
+        if content is not None:
+            (tmp_path / "config.json").write_text(content, encoding="utf-8")
+        with pytest.raises(UsageError, match=message) as error:
+            parse("--resume", str(tmp_path))
+        assert str(tmp_path) in str(error.value)
 
 
 def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
     for name in ("config.json", "eval.json"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
-    with pytest.raises(UsageError, match=r"is complete: its results are in .*eval\.json"):
-        parse("--resume", str(tmp_path))
-    with pytest.raises(UsageError, match=r"leave out --seed 1 --preset paper$"):
-        parse("--preset", "paper", "--resume", str(tmp_path), "--seed", "1")
-    with pytest.raises(UsageError, match=r"leave out --task nogo$"):
-        parse("--task", "nogo", "--resume", str(tmp_path))
+    for options, message in (
+        ((), r"is complete: its results are in .*eval\.json"),
+        (("--preset", "paper", "--seed", "1"), r"leave out --seed 1 --preset paper$"),
+        (("--task", "nogo"), r"leave out --task nogo$"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            parse(*options, "--resume", str(tmp_path))
 
 
 def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:

@@ -69,12 +69,6 @@ class Offline:
         self.run = self.records["run"][-1]
         self.history = [values(row.item) for row in self.records["history"]]
 
-    def table(self, name: str) -> list[dict[str, Any]]:
-        """Return the rows of a table."""
-        (path,) = (row[f"{name}.path"] for row in self.history if f"{name}.path" in row)
-        table = json.loads((self.folder / "files" / path).read_text(encoding="utf-8"))
-        return [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
-
 
 def only(folder: Path) -> Offline:
     """Return the one offline run of a run folder."""
@@ -117,9 +111,10 @@ def test_run_and_its_curves(finished: Path) -> None:
 
 
 def test_table_picture_policy_and_final_values(finished: Path) -> None:
-    offline = only(finished)
-    row = {"navigator": "a-navigator", "spl": 97.5, "steps": None, "num_tasks": 3}
-    assert offline.table("eval/navigators") == [row]
+    offline, row = only(finished), {"navigator": "a-navigator", "spl": 97.5, "steps": None, "num_tasks": 3}
+    (path,) = (row["eval/navigators.path"] for row in offline.history if "eval/navigators.path" in row)
+    table = json.loads((offline.folder / "files" / path).read_text(encoding="utf-8"))
+    assert [dict(zip(table["columns"], cells, strict=True)) for cells in table["data"]] == [row]
     assert 97.5 in [values(record.update).get("final/spl") for record in offline.records["summary"]]
     (picture,) = (row["figures/trajectories.path"] for row in offline.history if "figures/trajectories.path" in row)
     assert (offline.folder / "files" / picture).read_bytes() == (finished / "trajectories.png").read_bytes()
@@ -211,26 +206,18 @@ def test_missing_tensorboard_is_named(tmp_path: Path, monkeypatch) -> None:
     check_logger("csv")
 
 
-def test_without_wandb_a_run_goes_on(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    log = open_log("wandb", tmp_path, {}, "offline")
-    log.row({"frames": 512, "eval_spl": 90.0})
-    log.close()
-    assert capsys.readouterr().err.startswith("wandb failed and is disabled for the rest of this run: import of wandb")
-
-
 def test_failing_loggers_are_reported_and_disabled(tmp_path: Path, monkeypatch, capsys) -> None:
-    """Files that cannot be written, and wandb that cannot start or fails later."""
-
-    def broken(*_: object) -> SimpleNamespace:
-        return SimpleNamespace()  # a logger that has no experiment
+    """Files that cannot be written, and wandb that is missing, cannot start or fails later."""
 
     def unwritable(*_: object) -> None:
         raise PermissionError("wandb folder")
 
+    real, broken = loggers._wandb_logger, lambda *_: SimpleNamespace()  # a logger that has no experiment
     (tmp_path / "csv").write_text("in the way", encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "wandb", None)
     for name, make, reason in (
-        ("csv", broken, "File exists"),
+        ("csv", real, "File exists"),
+        ("wandb", real, "import of wandb"),
         ("wandb", broken, "no attribute 'experiment'"),
         ("wandb", unwritable, "wandb folder"),
     ):
