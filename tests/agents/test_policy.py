@@ -89,8 +89,6 @@ def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:
     content = load_tensors(path)
     for training, message in (
         ({"noise": [0.0, -1.0, 0.0]}, "noise.1 must be greater than or equal to 0, got -1"),
-        ({"noise": [0.0, 1e308, 0.0]}, "noise must be below"),
-        ({"zeta": math.nan}, "zeta must be a finite number, got nan"),
         ({"start_heading": "\x1b[2J"}, r"start_heading must be .*, got '\\x1b\[2J'"),
     ):
         save_tensors(content | {"training": training}, path)

@@ -55,7 +55,6 @@ def test_wrong_settings(tmp_path: Path) -> None:
         ({"destination": "60.4N 5.3E"}, "are the same place"),
         ({"destination": "60.4S 174.7W"}, "is the antipode of the start"),
         ({"destination": "86N 140E"}, "the declination is hardly defined at '86N 140E', where BH is"),
-        ({"errors": (0.1, -1.0, 0.0)}, "noise must be a finite number from 0 on, got -1.0"),
         ({"start_heading": math.inf}, "start_heading"),
         ({"export": Path("track.txt")}, "must end in .geojson, got 'track.txt'"),
         ({"animate": Path("flight.mp4")}, r"an animation must end in \.gif, got flight\.mp4"),

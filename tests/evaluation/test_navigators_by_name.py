@@ -111,11 +111,11 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
     assert not torch.equal(*(agent(env.reset())["action"] for agent in agents))
 
 
-@pytest.mark.parametrize("limits", [{"max_move_km": 20, "max_steps": 120}, {"max_turn_deg": 20}])
-def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limits: dict[str, int]) -> None:
-    episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 3), start_heading="random", **limits)
+def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment() -> None:
+    limits = {"max_move_km": 30, "max_turn_deg": 20, "max_steps": 80, "start_heading": "random"}
+    episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 3), **limits)
     assert episodes["success"].all()
-    assert episodes["spl"].mean() > 0.98
+    assert episodes["spl"].mean() > 0.95
 
 
 def test_navigators_that_are_given_twice(run: Path) -> None:
