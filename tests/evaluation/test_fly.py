@@ -14,7 +14,7 @@ from magrl.training import UsageError
 
 def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
     track, movie = tmp_path / "tracks" / "flight.geojson", tmp_path / "new" / "flight.gif"
-    options = ("--navigator", "secant", "--out", str(tmp_path), "--start-heading", "270", "--max-steps", "12")
+    options = ("--navigator", "secant", "--out", str(tmp_path), "--start-heading", "270", "--max-steps", "7")
     recipe.main(["-33.9 18.4", "-33.6, 18.9", *options, "--export", str(track), "--animate", str(movie)])
     assert "outcome         arrived\n" in capsys.readouterr().out
     result = json.loads((tmp_path / "flight.json").read_text(encoding="utf-8"))

@@ -51,7 +51,7 @@ def with_state(observations: np.ndarray, state: int | None) -> tuple[np.ndarray,
     return toward(observations) * (state is not None) - np.array([state is None, 0]), (state or 0) + 1
 
 
-BOX: dict[str, Any] = {"task": "box", "episodes": 16, "max_steps": 20}
+BOX: dict[str, Any] = {"task": "box", "episodes": 16, "max_steps": 14}
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_navigator_has_the_score_of_its_name() -> None:
 
 
 def test_the_episodes_are_those_of_the_seed_in_gymnasium(wanted: dict[str, float]) -> None:
-    envs, found = GeomagneticNavVectorEnv(16, task="box", max_steps=20), {}
+    envs, found = GeomagneticNavVectorEnv(16, task="box", max_steps=14), {}
     observations, _ = envs.reset(seed=SEED)
     earned, running = np.zeros(16), np.ones(16, dtype=bool)
     while running.any():
@@ -98,7 +98,7 @@ def test_the_episodes_are_those_of_the_seed_in_gymnasium(wanted: dict[str, float
 
 def test_the_state_of_a_function_is_passed_on(wanted: dict[str, float]) -> None:
     """The first step stands still."""
-    late = score(with_state, **BOX | {"max_steps": 21})
+    late = score(with_state, **BOX | {"max_steps": 15})
     assert late["steps"] == wanted["steps"] + 1
     assert late["SPL"] == pytest.approx(wanted["SPL"], rel=1e-3)
 

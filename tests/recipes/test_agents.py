@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from pandas import DataFrame
 from support.recipes import load
 
@@ -12,17 +14,20 @@ from magrl import score
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.sb3 import BatchedVecEnv
 
-stable = pytest.importorskip("stable_baselines3")
+contrib = pytest.importorskip("sb3_contrib")
 agents = load("tables/agents")
 
 
-def test_a_kept_agent_has_its_score(tmp_path: Path) -> None:
-    """Those with a memory are kept by the test of the sweep."""
+def test_an_agent_with_a_memory_acts_as_its_model() -> None:
     envs = BatchedVecEnv(GeomagneticNavVectorEnv(4, task="nogo", autoreset_mode="SameStep"))
-    model = stable.SAC("MlpPolicy", envs, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu")
-    agents.save_agent(tmp_path / "nogo-SAC.onnx", model.policy, "nogo")
-    kept, wanted = (score(agent, "nogo", episodes=4, max_steps=5) for agent in (tmp_path / "nogo-SAC.onnx", model))
-    assert kept == pytest.approx(wanted, rel=1e-3, nan_ok=True)
+    shape = {"net_arch": [8], "lstm_hidden_size": 8, "log_std_init": 0}
+    model = contrib.RecurrentPPO("MlpLstmPolicy", envs, policy_kwargs=shape, seed=0, device="cpu")
+    observation, memory, state = envs.reset(), (torch.zeros(4, 8), torch.zeros(4, 8)), None
+    for first in (np.ones(4), np.zeros(4)):
+        with torch.no_grad():
+            action, *memory = agents.Acting(model.policy)(torch.from_numpy(observation), *memory)
+        wanted, state = model.predict(observation, state, first, deterministic=True)
+        assert action.clamp(-1, 1).numpy() == pytest.approx(wanted, abs=1e-6)
 
 
 def test_the_agent_of_the_median_is_kept(tmp_path: Path) -> None:

@@ -29,21 +29,24 @@ bars = sys.modules["bars"]
 RESULTS = RECIPES.parent / "docs" / "results"
 
 
-def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("task", "name"), [("nogo", "PPO"), pytest.param("readings", "RecurrentPPO", marks=pytest.mark.slow)]
+)
+def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monkeypatch, task: str, name: str) -> None:
     monkeypatch.setattr(sweep, "VEHICLES", 4)
     monkeypatch.setattr(sweep, "POINTS", 2)
     monkeypatch.setattr(sweep, "score", partial(score, max_steps=5))
-    chosen = sweep.ALGORITHMS["RecurrentPPO"]
+    chosen = sweep.ALGORITHMS[name]
     settings = chosen.settings | {"n_steps": 2, "batch_size": 16}
-    few = chosen._replace(num_envs=8, thousands={"readings": 0.032}, settings=settings)
-    monkeypatch.setitem(sweep.ALGORITHMS, "RecurrentPPO", few)
-    job = (sweep.Config(out=tmp_path), "readings", "RecurrentPPO", 0)
+    few = chosen._replace(num_envs=8, thousands={task: 0.032}, settings=settings)
+    monkeypatch.setitem(sweep.ALGORITHMS, name, few)
+    job = (sweep.Config(out=tmp_path), task, name, 0)
     rows = read_csv(sweep.run(*job))
     assert rows["steps"].tolist() == [8, 16, 32, 32]
     assert rows[["task", "algorithm", "seed"]].drop_duplicates().to_numpy().tolist() == [[*job[1:]]]
     assert rows[["SR", "SPL"]].to_numpy().min() >= 0
     assert rows["cpu_s"].is_monotonic_increasing
-    kept = score(tmp_path / "readings-RecurrentPPO-seed0.onnx", "readings", episodes=4, max_steps=5)
+    kept = score(tmp_path / f"{task}-{name}-seed0.onnx", task, episodes=4, max_steps=5)
     assert rows[["SPL", "return"]].iloc[-1].tolist() == pytest.approx([kept["SPL"], kept["return"]], abs=0.02)
     monkeypatch.setattr(sweep, "trained", None)
     assert len(read_csv(sweep.run(*job))) == len(rows)

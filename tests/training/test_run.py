@@ -119,13 +119,13 @@ def test_run_that_ended_before_its_first_checkpoint_starts_again(tmp_path: Path,
         raise KeyboardInterrupt
 
     folder, whole = tmp_path / "killed", tmp_path / "whole"
-    train(whole, scenario=AZORES)
+    train(whole, scenario=AZORES, total_frames=4)
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoints, "save", killed)
         with pytest.raises(KeyboardInterrupt):
-            train(folder, scenario=AZORES, checkpoint_every=0)
+            train(folder, scenario=AZORES, total_frames=4, checkpoint_every=0)
     assert not (folder / "checkpoints").exists()
-    train(folder, scenario=AZORES, resume=folder)
+    train(folder, scenario=AZORES, total_frames=4, resume=folder)
     assert same_outcome(folder, whole)
 
 
