@@ -24,7 +24,8 @@ from torchrl.data import Composite
 import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
-from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
+from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
+from magrl.envs.navigation import NAMED_ENVS
 from magrl.transforms import CONDITIONS
 
 flights, publish = load("tables/flights"), load("tables/publish")
@@ -37,7 +38,8 @@ CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
 SCRIPTS = [
-    ROOT / "docs" / "examples" / f"{name}.py" for name in ("ddpg_anywhere", "navigator", "sac", "sb3_anywhere", "turns")
+    ROOT / "docs" / "examples" / f"{name}.py"
+    for name in ("ddpg_anywhere", "ins", "navigator", "sac", "sb3_anywhere", "turns")
 ]
 EXAMPLES += [(path, path.read_text(encoding="utf-8")) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]

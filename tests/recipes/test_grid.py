@@ -11,7 +11,7 @@ from PIL import Image
 from support.recipes import RECIPES
 from tensordict import TensorDict
 
-from magrl import IGRF, Scenario, Tasks, benchmark
+from magrl import benchmark
 from magrl.benchmark import COLUMNS, LEVELS, read_episodes
 from magrl.training import UsageError
 
