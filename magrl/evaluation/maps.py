@@ -340,9 +340,11 @@ def save_gif(path: Path, frames: Sequence[Image.Image], frame_ms: int = FRAME_MS
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "dark.gif"
-        >>> save_gif(path, [Image.new("RGB", (8, 8), color) for color in ("white", "gray", "black")])
-        >>> Image.open(path).n_frames
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "dark.gif"
+        ...     save_gif(path, [Image.new("RGB", (8, 8), color) for color in ("white", "gray", "black")])
+        ...     with Image.open(path) as image:
+        ...         image.n_frames
         3
     """
     sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])

@@ -55,7 +55,7 @@ class Flights(Track):
         """Return an episode of each task."""
         own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
         options = {key: None if own[key] == OWN_MODEL else own[key] for key in OWN_OPTIONS if key in own}
-        return flown(self.flight(errors, device=device, **options), {k: own[k] for k in own if k not in options}).cpu()
+        return flown(self.flight(errors, device=device, **options), {k: own[k] for k in own if k not in options})
 
     def episodes(self, navigator: Spec, errors: Errors, device: str = "cpu") -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
@@ -69,7 +69,7 @@ class Flights(Track):
 def flown(flight: Flight, navigator: Spec) -> TensorDictBase:
     """Return an episode of each vehicle."""
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    return flight.fly(flight.navigator(options.pop("name"), **options))
+    return flight.fly(flight.navigator(options.pop("name"), **options)).cpu()
 
 
 def clustered(values: Tensor, region: Tensor) -> tuple[float, float]:

@@ -52,7 +52,7 @@ def test_bad_usage(tmp_path: Path, monkeypatch) -> None:
     ):
         with pytest.raises(UsageError, match=message):
             grid.make(tables, **changes)
-    for figure, message in (("mars", "unknown figure"), ("section-4", "No such file"), ("learning-return", "no runs/")):
+    for figure, message in (("mars", "unknown figure"), ("section-4", "No such file"), ("learning", "no runs/")):
         with pytest.raises(UsageError, match=message):
             figures.draw((figure,))
 

@@ -170,7 +170,7 @@ def test_noise_is_observed_and_the_guidance_is_by_the_truth() -> None:
         (ppo_anywhere, "--distance-range-km 150 6000", "must end at 4400 km or below, the side of a region"),
         (ppo_anywhere, "--max-turn-deg 200", "max_turn_deg must be less than or equal to 180, got 200.0"),
         (ppo_anywhere, "--scenario docs/examples/azores.toml", "scenario must be left out"),
-        (ppo_memory, "--noise 0.1 0 0", "noise and drift are those of the task, got (0.1, 0.0, 0.0)"),
+        (ppo_memory, "--noise 0.1 0 0", "noise and drift are the task's, got (0.1, 0.0, 0.0)"),
         (ppo_anywhere, "--num-envs 8", "must not exceed num_envs * steps_per_batch, 256"),
     ],
 )

@@ -134,7 +134,7 @@ def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
         (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest leg"),
         (("0.83", "20"), (), "time runs backward from row 2 to 3, from 20 to 1.67: sort the rows"),
-        (("B_H", "B_H"), ("--every-km", "5000"), "every_km 5000 leaves one reading of 4: choose shorter moves"),
+        (("B_H", "B_H"), ("--every-km", "5000"), "every_km 5000 leaves one reading of 4: choose shorter legs"),
         (("B_H", "B_H"), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
         (("B_H", "B_H"), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
         (("B_H", "B_H"), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),
