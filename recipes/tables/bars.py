@@ -36,7 +36,7 @@ from torchrl.envs import EnvBase
 VEHICLES = 200
 COLUMNS = ("SR", "SPL", "steps", "return")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
-BARS |= {"told": "kalman, told the size of each error"}
+BARS |= {"told": "kalman, which knows the size of each error"}
 BARS |= {"around": "secant, least turn around the areas in sight"}
 BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
