@@ -43,8 +43,8 @@ def returns(env: TransformedEnv, policy: Callable[[TensorDict], TensorDict]) -> 
 def test_no_episode_without_an_arrival_earns_as_much_as_the_worst_arrival() -> None:
     """Standing still, turning on the spot, and every constant action, beside arrivals after 25 random moves."""
     grid = torch.cartesian_prod(torch.linspace(-1, 1, 5), torch.linspace(-1, 1, 17))
-    constant = navigation_env(4 * len(grid), seed=0)
-    earned, lucky = returns(constant, lambda state: state.set("action", grid.repeat(4, 1)))
+    constant = navigation_env(2 * len(grid), seed=0)
+    earned, lucky = returns(constant, lambda state: state.set("action", grid.repeat(2, 1)))
     env = navigation_env(64, seed=1, scale_actions=False)
     home = Geodesic.for_env(env.base_env)
 
@@ -53,9 +53,9 @@ def test_no_episode_without_an_arrival_earns_as_much_as_the_worst_arrival() -> N
 
     worst, arrived = returns(env, astray)
     assert arrived.sum() > 30
-    assert (~lucky).sum() > 300
+    assert (~lucky).sum() > 150
     assert earned[~lucky].max() < worst[arrived].min()
-    torch.testing.assert_close(earned[grid[:, 0].repeat(4) == -1], torch.full((68,), -5.0))  # who stands still
+    torch.testing.assert_close(earned[grid[:, 0].repeat(2) == -1], torch.full((34,), -5.0))  # who stands still
 
 
 def test_guidance_is_by_the_truth_and_a_compose_is_the_list_of_its_parts() -> None:

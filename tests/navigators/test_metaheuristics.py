@@ -20,7 +20,7 @@ every_algorithm = pytest.mark.parametrize("name", ["afsa", "ga", "pso"])
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(tasks=task_set(12, seed=81)), num_envs=12, seed=0)
+    return GeomagneticNavEnv(Scenario(tasks=task_set(8, seed=81, distance_range_km=(100, 200))), num_envs=8, seed=0)
 
 
 def bowl(candidate: torch.Tensor) -> torch.Tensor:

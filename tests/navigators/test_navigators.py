@@ -3,6 +3,7 @@
 import copy
 import itertools
 import math
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -53,7 +54,7 @@ def noisy(navigator, noise: tuple[float, float, float]) -> Callable:
 
 def test_kalman_arrives_without_a_map() -> None:
     """From any heading, by the standard deviations that come with the readings."""
-    base = GeomagneticNavEnv(Scenario(tasks=task_set(10, seed=93)), num_envs=10, seed=0, start_heading="random")
+    base = GeomagneticNavEnv(Scenario(tasks=task_set(4, seed=93)), num_envs=4, seed=0, start_heading="random")
     summary = flown(TransformedEnv(base, SensorErrors(NOISE)), Kalman())
     assert summary["success_rate"] == 100
     assert summary["spl"] > 95
@@ -63,7 +64,7 @@ def test_a_navigator_that_is_told_of_its_arrival_searches() -> None:
     """Under constant errors the destination is not where the readings fit."""
     biased, rates = Conditions("biased", sensors={"bias": (0.15, 0.05, 20.0)}), []
     for search in (False, True):
-        base = GeomagneticNavEnv(num_envs=30, seed=0)
+        base = GeomagneticNavEnv(num_envs=30, seed=0, max_steps=30)
         navigator = make_navigator("secant", base, sensor_std=biased.std)
         assert navigator.search
         navigator.search = search
@@ -215,9 +216,9 @@ def test_declination_continues_across_half_a_turn(env, name: str) -> None:
 
     moves = []
     for wrapped in (False, True):
-        few = GeomagneticNavEnv(env.scenario, num_envs=20, seed=0)
+        few = GeomagneticNavEnv(env.scenario, num_envs=8, seed=0)
         policy = rotated(make_navigator(name, few), wrapped)
-        moves.append(few.rollout(8, policy, break_when_any_done=False)["action"])
+        moves.append(few.rollout(4, policy, break_when_any_done=False)["action"])
     torch.testing.assert_close(moves[0], moves[1], rtol=1e-3, atol=1e-3)
 
 
@@ -289,6 +290,7 @@ def test_a_reading_that_is_nan_is_not_flown(env) -> None:
 @pytest.mark.parametrize("name", sorted({*NAVIGATORS} - {"kalman"}))  # which is in anywhere
 def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch) -> None:
     """In a decision, without the choice of rows in a batch, whose number depends on values."""
+    monkeypatch.setattr(sys.modules["magrl.tracking.destination"], "_STEPS", 1)
     arrival = "declared" if name in ("anywhere", "dead_reckoning") else "objective"
     env = GeomagneticNavEnv(num_envs=2, seed=0, arrival=arrival)
     small = {"generations": 2, "population_size": 3} if issubclass(NAVIGATORS[name], Metaheuristic) else {}

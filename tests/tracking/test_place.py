@@ -153,9 +153,9 @@ def test_models_and_rules_that_do_not_fit(call, message: str) -> None:
 
 
 def scenario_of(latitude: float) -> Scenario:
-    scenario = earth_scenario(8, 3, max_move_km=90.0, max_latitude=latitude, distance_range_km=(300.0, 500.0))
-    scenario = scenario.replace(max_move_km=50.0, max_steps=25, arrival="declared", start_heading="random")
-    return scenario.with_tasks(scenario.random_tasks(12, 3))
+    scenario = earth_scenario(4, 3, max_move_km=90.0, max_latitude=latitude, distance_range_km=(300.0, 500.0))
+    scenario = scenario.replace(max_move_km=50.0, max_steps=15, arrival="declared", start_heading="random")
+    return scenario.with_tasks(scenario.random_tasks(6, 3))
 
 
 def test_a_model_and_a_start_beat_dead_reckoning() -> None:

@@ -52,8 +52,8 @@ def assert_equal(found: Track | list[Tensor], expected: Track | list[Tensor]) ->
 
 
 def test_the_track_is_that_of_the_pure_functions() -> None:
-    """Bit for bit over 7 steps, in which each vehicle begins twice again."""
-    rollout, before = flown(erring(start_heading="random", max_steps=3), 7), None
+    """Bit for bit over 5 steps, in which each vehicle begins twice again."""
+    rollout, before = flown(erring(start_heading="random", max_steps=2), 5), None
     for row in rollout.unbind(1):
         now, after, found = reading_of(row), reading_of(row["next"]), track_of(row["track"])
         if (now.step == 0).all():
@@ -94,11 +94,12 @@ def test_without_noise_it_finds_gradient_and_destination() -> None:
 
 
 def test_the_transform_declares_as_the_navigator() -> None:
-    base = GeomagneticNavEnv(num_envs=8, seed=0, arrival="declared", max_steps=12)
+    options = {"arrival": "declared", "max_steps": 8, "distance_range_km": (60, 150)}
+    base = GeomagneticNavEnv(num_envs=4, seed=0, **options)
     plain = TransformedEnv(base, SensorErrors(STD, bias=BIAS, seed=3))
-    rules = RULES.replace(arrival="declared", max_steps=12)
+    rules = RULES.replace(arrival="declared", max_steps=8)
     wanted = evaluation_rollout(plain, Declaring(Secant(), rules))
-    env = tracked(8, SensorErrors(STD, bias=BIAS, seed=3), rules=rules, arrival="declared", max_steps=12)
+    env = tracked(4, SensorErrors(STD, bias=BIAS, seed=3), rules=rules, **options)
     env.append_transform(DeclareArrival(rules, known_keys(env.observation_spec)))
     found = evaluation_rollout(env, Secant())
     assert torch.equal(found["next", "position"], wanted["next", "position"])

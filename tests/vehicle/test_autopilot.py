@@ -176,14 +176,9 @@ class Played(World):
     report = steer
 
 
-def record(folder: Path) -> list[str]:
-    """The lines of a record, the header first."""
-    return (folder / "messages.csv").read_text(encoding="utf-8").splitlines(keepends=True)
-
-
 def half(folder: Path) -> list[str]:
     """The first messages of a record."""
-    lines = record(folder)
+    lines = (folder / "messages.csv").read_text(encoding="utf-8").splitlines(keepends=True)
     return lines[1 : len(lines) // 2]
 
 

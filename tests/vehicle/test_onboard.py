@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import json
 import math
 import operator
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import FrameType
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -120,7 +122,7 @@ def test_commands_are_those_of_the_environment(
     target = env.reset()["target_field"][0].tolist()
     vehicle.start((None, *target[1:]) if magnetic else target)
     outages = []
-    for command, state, after in fly(env, policy, vehicle, 99 if name == "kalman" else 8, none=int(magnetic)):
+    for command, state, after in fly(env, policy, vehicle, 99 if name == "kalman" else 6, none=int(magnetic)):
         check(command, policy, after)
         outages.append(state["sensor_std"].max().item() > 100)
     assert len(outages) > 5
@@ -197,32 +199,28 @@ def test_a_file_of_a_pilot_and_shorter_moves(tmp_path: Path) -> None:
 # What runs
 
 
-CODE = """
-import sys
-from magrl.vehicle.onboard import Onboard
-def profile(frame, event, argument):
-    global calls, others
-    code = frame.f_code
-    if event == "call" and "/magrl/" in code.co_filename and "<" not in code.co_name:
-        functions.add((code.co_filename, code.co_qualname))
-        calls += 1
-    others += "torchrl" in code.co_filename or "tensordict" in code.co_filename
-functions, calls, others = set(), 0, 0
-vehicle = Onboard("anywhere", sensor_std=(0.02, 0.02, 2.0))
-vehicle.start((-11.6, 75.4, 13240.0))
-vehicle.step(3.5, 73.0, 15000.0, 290.0)
-vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
-sys.setprofile(profile)
-vehicle.step(3.3, 73.1, 14985.0, 290.0, 20.0)
-sys.setprofile(None)
-print(len(functions), calls, others + sum(name in sys.modules for name in ("torchrl", "tensordict")))
-"""
-
-
 def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
-    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, encoding="utf-8")
-    functions, calls, others = map(int, run.stdout.split())
-    assert (functions <= 144, calls <= 715, others) == (True, True, 0)
+    """Imported anew, where TorchRL and TensorDict cannot be."""
+    made: list[tuple[str, str]] = []
+
+    def profile(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event == "call" and "/magrl/" in code.co_filename and "<" not in code.co_name:
+            made.append((code.co_filename, code.co_qualname))
+
+    with patch.dict(sys.modules):
+        for name in [name for name in sys.modules if name.partition(".")[0] == "magrl"]:
+            del sys.modules[name]
+        sys.modules |= {name: None for name in list(sys.modules) if name.partition(".")[0] in ("torchrl", "tensordict")}
+        vehicle = importlib.import_module("magrl.vehicle.onboard").Onboard("anywhere", sensor_std=NOISE)
+        vehicle.start(TARGET)
+        vehicle.step(*HERE, 290.0)
+        vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
+        sys.setprofile(profile)
+        vehicle.step(3.3, 73.1, 14985.0, 290.0, 20.0)
+        sys.setprofile(None)
+    assert 99 < len(set(made)) <= 144
+    assert len(made) <= 715
 
 
 # A known start
@@ -365,7 +363,7 @@ def test_readings_all_over_the_earth_are_taken() -> None:
     """Of IGRF, 1900 and 2030; moves of 50 km eastward and northward up to 85 degrees of latitude."""
     for date in ("1900-01-01", "2030-01-01"):
         latitude = torch.arange(-85.0, 85.1, 5.0, dtype=torch.float64)
-        place = torch.cartesian_prod(latitude, torch.arange(-180.0, 180.0, 15.0, dtype=torch.float64))
+        place = torch.cartesian_prod(latitude, torch.arange(-180.0, 180.0, 30.0, dtype=torch.float64))
         north = place + torch.tensor([0.45, 0.0])
         east = torch.stack((place[:, 0], place[:, 1] + 0.45 / torch.cos(torch.deg2rad(place[:, 0]))), -1)
         here, *there = (elements_at(IGRF(date), places).tolist() for places in (place, north, east))
@@ -442,10 +440,8 @@ def test_readings_of_no_field_are_noticed(sign: float, zero: float, lost: bool) 
     [
         ((0, 1, 2), (0.5, 0.5, 50.0), 2, "no change of D, I, B_H over 100 km: a sensor is stuck"),
         ((1,), (0.5, 0.5, 50.0), 8, "no change of I over 400 km: a sensor is stuck"),
-        ((), (0.5, 0.5, 50.0), None, ""),
         ((0,), (5.0, *NOISE[1:]), None, ""),
         ((1,), (NOISE[0], 1e4, NOISE[2]), None, ""),
-        ((2,), (*NOISE[:2], 5000.0), None, ""),
     ],
 )
 def test_a_stuck_sensor(held: tuple[int, ...], std: Triple, moves: int | None, reason: str) -> None:
