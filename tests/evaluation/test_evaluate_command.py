@@ -34,7 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
-    evaluate.main([f"gg_td3={run}", "secant", "pso", "--tasks", "4", "--max-steps", "8", "--out", str(out)])
+    evaluate.main([f"gg_td3={run}", "secant", "pso", "--tasks", "4", "--max-steps", "3", "--out", str(out)])
     return out
 
 
@@ -95,7 +95,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     config = {"scenario": path, "out": out, "export": tracks}
     with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
-    options = {"margin_deg": 8.0, "max_steps": 20, "max_turn_deg": 120.0, "start_heading": "random"}
+    options = {"margin_deg": 8.0, "max_steps": 8, "max_turn_deg": 120.0, "start_heading": "random"}
     own = load_scenario(path, margin_deg=8.0)
     run = make_run(
         tmp_path / "run", GeomagneticNavEnv(own), scenario="scenario.toml", zeta=0.02, start_heading="random"

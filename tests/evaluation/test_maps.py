@@ -27,7 +27,7 @@ def place(*degrees: float) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=3, seed=0, max_steps=6)
+    return GeomagneticNavEnv(num_envs=3, seed=0, max_steps=3)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from magrl.training import UsageError
 
 minari = pytest.importorskip("minari")
 recipe = load("../docs/examples/offline_dataset")
-SMALL = ["--regions", "2", "--episodes", "6", "--distance-range-km", "60", "90", "--max-steps", "6", "--seed", "1"]
+SMALL = ["--regions", "2", "--episodes", "3", "--distance-range-km", "60", "90", "--max-steps", "4", "--seed", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_torchrl_loads_them_from_disk(tmp_path: Path, monkeypatch) -> None:
         same = steps["episode"][1:] == steps["episode"][:-1]
         assert torch.equal(steps["next", "done"].flatten(), torch.cat((~same, torch.ones(1, dtype=torch.bool))))
         assert torch.equal(after["field"][:-1][same], before["field"][1:][same])
-        total[policy] = steps["next", "reward"].sum().item() / 6
+        total[policy] = steps["next", "reward"].sum().item() / 3
     metadata = minari.load_dataset("magrl/earth-secant-0_05-v0").storage.metadata
     assert total["kalman"] > total["random"]
     assert metadata["ref_max_score"] == pytest.approx(total["kalman"])
@@ -60,14 +60,14 @@ def test_the_environment_in_the_metadata_repeats_them() -> None:
     data = minari.load_dataset("magrl/earth-secant-0_05-v0")
     metadata, episodes = data.storage.metadata, list(data.iterate_episodes())
     assert metadata["command"] == "python docs/examples/offline_dataset.py --field earth " + (
-        "--episodes 6 --regions 2 --distance-range-km 60.0 90.0 --max-steps 6 --seed 1"
+        "--episodes 3 --regions 2 --distance-range-km 60.0 90.0 --max-steps 4 --seed 1"
     )
     envs = eval(metadata["environment"], {"gymnasium": gymnasium, "magrl": magrl})
     assert envs.single_observation_space == data.observation_space
     state, _ = envs.reset(seed=next(iter(data.storage.get_episode_metadata([0])))["seed"])
-    for step in range(6):
+    for step in range(4):
         running = [row for row, episode in enumerate(episodes) if step < len(episode)]
-        actions = np.zeros((6, 2), dtype=np.float32)
+        actions = np.zeros((3, 2), dtype=np.float32)
         for row in running:
             actions[row] = episodes[row].actions[step]
             reading = {key: episodes[row].observations[key][step] for key in PUBLIC_KEYS}

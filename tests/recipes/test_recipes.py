@@ -47,7 +47,10 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     """With networks, optimizers, running episodes and the noise of their sensors; the run folder is complete."""
     whole, run = tmp_path / "whole", tmp_path / "run"
     noise = (0.0, 0.0, 0.0) if module is ppo_memory else NOISE  # the task has errors of its own
+    short = "date = 2022-01-01\nregion = {latitude = [-30, 0], longitude = [150, 180]}\nmax_steps = 8"
+    (tmp_path / "short.toml").write_text(short, encoding="utf-8")
     frames = {"steps_per_batch": 2, "total_frames": 64, "noise": noise, "eval_every": 2}
+    frames |= {"scenario": tmp_path / "short.toml"} if module is recipe else {}
     result = module.train(small(module, whole, **frames))
     with signalled(2, signal.SIGINT), pytest.raises(SystemExit) as stop:
         module.train(small(module, run, **frames))
@@ -59,7 +62,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert not (run / "checkpoints").exists()
 
     files = {"config.json", "train.csv", "policy.safetensors", "eval.json", "training.png"}
-    assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "trajectories.png"}
+    assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "scenario.toml", "trajectories.png"}
     assert with_paths(whole) == []
     written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
     assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 64)
@@ -90,8 +93,9 @@ def test_a_task_takes_its_preset_unless_another_is_given() -> None:
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys) -> None:
+def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatch) -> None:
     """Its policy sees areas in training and evaluation, and flies where there are some."""
+    monkeypatch.setattr(recipe, "NO_GO_STEPS", 4)
     recipe.train(small(recipe, tmp_path / "run", task="nogo", total_frames=64, eval_every=4))
     assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
     rows, _ = outcome(tmp_path / "run")
@@ -127,8 +131,9 @@ def test_options_reach_the_training(tmp_path: Path, outcome) -> None:
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys) -> None:
+def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys, monkeypatch) -> None:
     """The first episodes end before the replay buffer holds a batch; progress is shown in episodes."""
+    monkeypatch.setattr(recipe, "NO_GO_STEPS", 10)
     options = {"total_episodes": 1, "total_frames": 88, "batch_size": 85, "num_envs": 4, "zeta": 1e-12}
     result = recipe.train(small(recipe, tmp_path, task="nogo", **options))
     text = capsys.readouterr()

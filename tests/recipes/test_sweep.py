@@ -35,7 +35,7 @@ RESULTS = RECIPES.parent / "docs" / "results"
 def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monkeypatch, task: str, name: str) -> None:
     monkeypatch.setattr(sweep, "VEHICLES", 4)
     monkeypatch.setattr(sweep, "POINTS", 2)
-    monkeypatch.setattr(sweep, "score", partial(score, max_steps=5))
+    monkeypatch.setattr(sweep, "score", partial(score, max_steps=2))
     chosen = sweep.ALGORITHMS[name]
     settings = chosen.settings | {"n_steps": 2, "batch_size": 16}
     few = chosen._replace(num_envs=8, thousands={task: 0.032}, settings=settings)
@@ -46,7 +46,7 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     assert rows[["task", "algorithm", "seed"]].drop_duplicates().to_numpy().tolist() == [[*job[1:]]]
     assert rows[["SR", "SPL"]].to_numpy().min() >= 0
     assert rows["cpu_s"].is_monotonic_increasing
-    kept = score(tmp_path / f"{task}-{name}-seed0.onnx", task, episodes=4, max_steps=5)
+    kept = score(tmp_path / f"{task}-{name}-seed0.onnx", task, episodes=4, max_steps=2)
     assert rows[["SPL", "return"]].iloc[-1].tolist() == pytest.approx([kept["SPL"], kept["return"]], abs=0.02)
     monkeypatch.setattr(sweep, "trained", None)
     assert len(read_csv(sweep.run(*job))) == len(rows)
@@ -130,7 +130,7 @@ def test_the_rule_turns_as_little_as_clears_the_area_ahead() -> None:
 
 
 def test_references_around_areas_keep_their_order(monkeypatch) -> None:
-    monkeypatch.setattr(bars, "VEHICLES", 40)
+    monkeypatch.setattr(bars, "VEHICLES", 24)
     bars.bar.cache_clear()
     straight, rule, sighted, around = (bars.bar("nogo", name) for name in ("geodesic", "around", "sighted", "detour"))
     bars.bar.cache_clear()

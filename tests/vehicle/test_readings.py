@@ -137,13 +137,13 @@ DATE = "2026-06-30"
 @cache  # a frame that is not changed
 def log() -> pandas.DataFrame:
     """Fifteen readings from Newfoundland, where D is -16 degrees, with the noise of sensors and of the crust."""
-    place, rows = torch.tensor([48.0, -50.0], dtype=torch.float64), []
+    place, rows, field = torch.tensor([48.0, -50.0], dtype=torch.float64), [], IGRF(DATE)
     noise = np.random.default_rng(0).normal(0, (0.1, 0.05, 50.0), (15, 3))
     for row in range(15):
         heading, distance = 70.0 + 10 * row, 20.0 if row else 0.0
         turn = torch.deg2rad(torch.tensor(heading)).double()
         place = torch.stack(move(*place, turn, torch.tensor(distance).double()))
-        d, i, b = (elements_at(IGRF(DATE), place).numpy() + noise[row]).tolist()
+        d, i, b = (elements_at(field, place).numpy() + noise[row]).tolist()
         latitude, longitude = place.tolist()
         rows.append({"D": d, "I": i, "B_H": b, "heading": heading, "distance": distance})
         rows[-1] |= {"latitude": latitude, "longitude": longitude}
