@@ -205,13 +205,18 @@ def separate(weights: Tensor, degree: int) -> Tensor:
     angles, to_coefficients = chebyshev_nodes(degree + 1, weights.device)
     meridian = torch.stack((angles.sin(), torch.zeros_like(angles), angles.cos()), -1)
     legendre = basis(meridian * REFERENCE_RADIUS_KM, degree)[::2]
-    polynomial = legendre / angles.sin() ** odd.unsqueeze(-1)
-    cosine, sine = (weights[:, k::2, None] * (polynomial @ to_coefficients.T) for k in (0, 1))
-    full = weights.new_zeros(len(weights), 2, *[degree + 1] * 3)  # row, sine or cosine, m, d, i
-    # An odd order gives one factor (a/r) to the sine of the colatitude: then d - i is even for every order.
-    full[:, :, m, n - odd] = torch.stack((sine, cosine), 1)
-    parts = [full[..., range(2 * k, degree + 1), range(degree + 1 - 2 * k)] for k in range(degree // 2 + 1)]
-    return torch.cat(parts, -1).flatten(1, 2)[:, 1:]
+    polynomial = (legendre / angles.sin() ** odd.unsqueeze(-1)) @ to_coefficients.T
+
+    def separated(rows: Tensor) -> Tensor:
+        cosine, sine = (rows[:, k::2, None] * polynomial for k in (0, 1))
+        full = rows.new_zeros(len(rows), 2, *[degree + 1] * 3)  # row, sine or cosine, m, d, i
+        # An odd order gives one factor (a/r) to the sine of the colatitude: then d - i is even for every order.
+        full[:, :, m, n - odd] = torch.stack((sine, cosine), 1)
+        parts = [full[..., range(2 * k, degree + 1), range(degree + 1 - 2 * k)] for k in range(degree // 2 + 1)]
+        return torch.cat(parts, -1).flatten(1, 2)[:, 1:]
+
+    # At degree 133 one row of temporary arrays takes 40 MB.
+    return torch.cat([separated(rows) for rows in weights.split(max(1, 2**20 // (degree + 1) ** 3))])
 
 
 def on_surface(weights: Tensor, axis_km: Tensor, z_km: Tensor, degree: int) -> Tensor:

@@ -55,9 +55,7 @@ class SphericalHarmonicField(Float64Module):
         padding = (0, gradient.shape[1] - value.shape[1])
         all_rows = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
         for name, table, degree in (("value", value, self.degree + 1), ("gradient", all_rows, self.degree + 2)):
-            # One row at a time: at degree 133 a row of temporary arrays takes 40 MB.
-            weights = torch.cat([harmonics.separate(row, degree) for row in table.split(1)])
-            self.register_buffer(f"{name}_weights", weights)
+            self.register_buffer(f"{name}_weights", harmonics.separate(table, degree))
             self.register_buffer(f"level_{name}_weights", _at_altitude(table, degree, self.altitude_km))
 
     def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:

@@ -18,15 +18,15 @@ SHIFT = torch.tensor([0.1, 0.05, -120.0], dtype=torch.float64)
 
 
 def write_log(path: Path) -> None:
-    """A track of 1700 km southward from 450 to 470 km of altitude, a row every 43 km."""
-    along = 42.5 * torch.arange(41, dtype=torch.float64)
+    """A track of 1700 km southward from 450 to 470 km of altitude, a row every 57 km."""
+    along = 56.7 * torch.arange(31, dtype=torch.float64)
     start = torch.full_like(along, -10.0), torch.full_like(along, -30.0)
     place = torch.stack(move(*start, torch.full_like(along, 3.0), along), -1)
     altitude = torch.linspace(450, 470, len(along), dtype=torch.float64)
     elements = measured_elements(IGRF("2016-01-01")(*place.unbind(-1), altitude)) + SHIFT
     rows = torch.cat((place, altitude.unsqueeze(-1), elements), -1)
     table = pd.DataFrame(rows.numpy(), columns=["latitude", "longitude", "altitude_km", "D", "I", "B_H"])
-    table = table.assign(heading=torch.rad2deg(torch.tensor(3.0)).item(), distance=42.5, time="2016-01-01 00:00:00")
+    table = table.assign(heading=torch.rad2deg(torch.tensor(3.0)).item(), distance=56.7, time="2016-01-01 00:00:00")
     table["time"] = pd.to_datetime(table["time"]) + pd.to_timedelta(6 * table.index, unit="s")
     table.loc[0, "distance"] = 0.0
     table.to_csv(path, index=False)
