@@ -130,6 +130,7 @@ def test_bad_usage_is_refused_before_anything_is_flown(tmp_path, monkeypatch) ->
         (("secant",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
         (("secant",), {"tasks_seed": 7}, "--tasks-seed 7 needs a number of random tasks, such as --tasks 300"),
         (("ga",), {"seed": -1}, "seed"),
+        (("secant",), {"device": "tpu"}, "device 'tpu' cannot be used here .*: choose another, such as cpu"),
         (("secant",), {"scenario": Path("missing.toml")}, "no scenario file at"),
         (("secant",), {"export": Path("tracks.shp")}, "must end in .geojson, got"),
     ):
