@@ -114,12 +114,12 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) $$(grep '^torch==' constraints.txt)
 	@$(PIP) -c constraints.txt -e '.[recipes]'
-	touch $@
+	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@$(PIP) -c constraints.txt -e '.[dev]'
-	touch $@
+	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	@$(PIP) -c constraints.txt -e '.[docs]'
-	touch $@
+	@touch $@
