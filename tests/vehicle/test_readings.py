@@ -126,7 +126,8 @@ def test_a_log_that_lacks_something_is_refused() -> None:
     for message, column in cases.items():
         with pytest.raises(ValueError, match=message):
             readings_of(Log(whole.drop(columns=column), "by hand", "true"), north="true")
-    for options, message in (({}, "the north of"), ({"north": "grid"}, "grid")):
+    wrong = {"the north of": {}, "grid": {"north": "grid"}, "every_km": {"north": "true", "every_km": 0.0}}
+    for message, options in wrong.items():
         with pytest.raises(ValueError, match=message):
             readings_of(Log(whole, "by hand"), **options)
 
