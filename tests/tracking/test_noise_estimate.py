@@ -46,7 +46,7 @@ def seen(residual: torch.Tensor, variance: torch.Tensor) -> Innovation:
 def test_the_estimate_by_hand() -> None:
     """Stated noise of 1 with a ratio of 2, and as much of the field: R / S = 1 / 2.
 
-    The innovations are 0, 2 and 100 standard deviations of S: evidence of -1/4, 3/4, and 8 in place of 2500.
+    Innovations of 0, 2 and 100 standard deviations give an evidence of -1/4, 3/4 and 8, the limit, instead of 2500.
     """
     before = NoiseEstimate(f64(2.0).log().expand(3), f64(1.0).expand(3))
     after = noise_estimate(before, seen(f64(0.0, 4.0, 200.0) * NOISE, 4 * NOISE.square()), NOISE)
