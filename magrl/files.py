@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 MAX_FILE_BYTES = 10_000_000
 """Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
-MAX_COLUMNS, MAX_CELLS = 1000, 10_000_000
-"""Most columns of a table, and most cells of a table that are blank because its rows are short."""
 
 
 class DamagedFileError(ValueError):
@@ -336,26 +334,28 @@ def read_text(path: Path) -> str:
         raise ValueError(f"byte {error.start + 1} is not UTF-8: save the file as text in UTF-8") from error
 
 
-def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
-    """Return the rows of a table below its header; cells that lack at the end of a row are blank.
+def read_table(text: str, **options: Any) -> DataFrame:
+    """Return the rows of a CSV table below its header; cells that lack at the end of a row are blank.
 
     Args:
         text: the table.
-        separator: character between cells.
         options: of :func:`pandas.read_csv` for the values.
 
     Raises:
-        ValueError: for no row, too many columns or cells, two columns of one name, a row of more cells than the header,
-            or a quoted text that is not closed.
+        ValueError: for no row, two columns of one name, a row of more cells than the header, or a quoted text that is
+            not closed.
 
     Example:
         >>> read_table("time, x" + chr(10) + "0, 1")["x"].tolist()
         [1]
     """
-    _check_table(text.strip(), separator)
     import pandas  # where it is needed: it takes long to import
 
-    shape: dict[str, Any] = {"sep": separator, "skipinitialspace": True, "index_col": False, "low_memory": False}
+    names = next(csv.reader(text.splitlines()[:1], skipinitialspace=True), [])
+    for name, count in Counter(map(str.strip, names)).items():
+        if name and count > 1:
+            raise ValueError(f"{count} columns have the name {short(name)}: keep one of them")
+    shape: dict[str, Any] = {"skipinitialspace": True, "index_col": False, "low_memory": False}
     try:
         with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
             table = pandas.read_csv(io.StringIO(text), **shape, **options)
@@ -363,25 +363,6 @@ def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
         reason = "a row has more cells than the header, or a quoted text is not closed"
         raise ValueError(f"{reason}: {str(error).strip()}") from error
     return table.rename(columns=str.strip)
-
-
-def _check_table(text: str, separator: str) -> None:
-    """Raise before a table takes memory: a short text may hold very many blank cells."""
-    header, _, rows = text.partition("\n")
-    if not rows:
-        raise ValueError("the table has no row")
-    columns, cells = header.count(separator) + 1, (header.count(separator) + 1) * (rows.count("\n") + 1)
-    if columns > MAX_COLUMNS:
-        raise ValueError(f"the table has {columns} columns: keep those that are needed, at most {MAX_COLUMNS}")
-    if cells > MAX_CELLS + rows.count(separator):
-        raise ValueError(f"the table has {cells} cells, most of them blank: leave out columns that are not needed")
-    try:
-        (names,) = csv.reader([header], delimiter=separator, skipinitialspace=True)
-    except csv.Error as error:
-        raise ValueError(f"the header cannot be read: {error}") from error
-    for name, count in Counter(map(str.strip, names)).items():
-        if name and count > 1:
-            raise ValueError(f"{count} columns have the name {short(name)}: keep one of them")
 
 
 def numbers(column: Series) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
     python recipes/replay_log.py docs/examples/log.csv --noise 0.02 0.02 2
     python recipes/replay_log.py track.csv --target -11.6 75.4 13240 --navigator kalman
-    python recipes/replay_log.py track.csv --declination dec_deg --horizontal H_nT --every-km 20
+    python recipes/replay_log.py track.csv --declination dec_deg --horizontal H_nT
     python recipes/replay_log.py track.csv --north magnetic --noise 0 0.1 20     # as a vehicle without true north
 
 Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the heading [deg] and the length [km] of the leg
@@ -29,7 +29,7 @@ from magrl.geodesy import check_positions, geodesic
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
-from magrl.vehicle.logs import difference_from_igrf, joined, mistakes, read_readings
+from magrl.vehicle.logs import difference_from_igrf, mistakes, read_readings
 from magrl.vehicle.onboard import Onboard
 
 import numpy as np
@@ -71,8 +71,6 @@ class Config:
     """Standard deviations of constant and slow errors of D [deg], I [deg], B_H [nT]."""
     radius_km: float = 25.0
     """Arrival radius around the destination [km]."""
-    every_km: float = 0.0
-    """Minimum length of a leg [km]; readings of shorter legs are averaged."""
     date: str | None = None
     """Date of the log, for IGRF; by default from the column of the time, if it has dates."""
     start_km: float | None = None
@@ -291,7 +289,7 @@ def main(args: Sequence[str] | None = None) -> None:
         log = read_log(config)
         for name in ("log.csv", "log.md", "log.png"):
             check_writable(config.out / name)
-        table = with_truth(config, replay(config, joined(log, config.every_km), log.attrs["date"]))
+        table = with_truth(config, replay(config, log, log.attrs["date"]))
         checked = log.assign(D_std=OUTAGE_STD * (config.north == "magnetic"))
         warnings = log.attrs["notes"] + mistakes(checked, log.attrs["date"])
     except (ValueError, OSError) as error:

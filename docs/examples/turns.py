@@ -2,10 +2,10 @@
 
 import math
 
+from magrl.field.elements import axes_of_elements, elements_of_axes
 from magrl.sensor_std import SensorStd
 from magrl.tracking import read, start
 from magrl.tracking.belief import IRON
-from magrl.vehicle.logs import axes_of_elements, elements_of_axes
 
 import torch
 

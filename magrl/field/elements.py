@@ -148,3 +148,54 @@ def elements_gradient(b_ned: Tensor, b_gradient: Tensor) -> Tensor:
     """
     check_tensor(3, 2, b_gradient=b_gradient)
     return elements_jacobian(b_ned) @ b_gradient
+
+
+def rotation(attitude_deg: Tensor) -> Tensor:
+    """Return the rotation from the vehicle's axes to the world's.
+
+    Args:
+        attitude_deg: ``(..., 3)`` roll, pitch, heading [deg].
+
+    Returns:
+        ``(..., 3, 3)``: forward, right, down to north, east, down, if the heading is from true north.
+
+    Example:
+        >>> (rotation(torch.tensor([0.0, 0.0, 90.0])) @ torch.tensor([1.0, 0.0, 0.0])).round()  # forward is east
+        tensor([-0., 1., 0.])
+    """
+    check_tensor(3, attitude_deg=attitude_deg)
+    (sr, sp, sh), (cr, cp, ch) = (f(torch.deg2rad(attitude_deg)).unbind(-1) for f in (torch.sin, torch.cos))
+    north = cp * ch, sr * sp * ch - cr * sh, cr * sp * ch + sr * sh
+    east = cp * sh, sr * sp * sh + cr * ch, cr * sp * sh - sr * ch
+    return torch.stack((*north, *east, -sp, sr * cp, cr * cp), -1).unflatten(-1, (3, 3))
+
+
+def elements_of_axes(axes_nt: Tensor, attitude_deg: Tensor) -> Tensor:
+    """Return D [deg], I [deg], B_H [nT] ``(..., 3)`` of three axes and an attitude.
+
+    D is from the north of the heading: it is the field's if this is true north.
+
+    Args:
+        axes_nt: ``(..., 3)`` the field forward, right, down [nT].
+        attitude_deg: ``(..., 3)`` roll, pitch, heading [deg].
+
+    Example:
+        >>> elements_of_axes(torch.tensor([0.0, -20000.0, 40000.0]), torch.tensor([0.0, 0.0, 90.0])).round()
+        tensor([    0.,    63., 20000.])
+    """
+    check_tensor(3, axes_nt=axes_nt)
+    return measured_elements((rotation(attitude_deg) @ axes_nt.unsqueeze(-1)).squeeze(-1))
+
+
+def axes_of_elements(elements: Tensor, attitude_deg: Tensor) -> Tensor:
+    """Return the field along the vehicle's axes [nT] ``(..., 3)``: the inverse of :func:`elements_of_axes`.
+
+    Args:
+        elements: ``(..., 3)`` D [deg], I [deg, inside (-90, 90)], B_H [nT].
+        attitude_deg: ``(..., 3)`` roll, pitch, heading [deg], the heading from the north of D.
+
+    Example:
+        >>> axes_of_elements(torch.tensor([0.0, 0.0, 20000.0]), torch.tensor([0.0, 0.0, 90.0])).round()
+        tensor([ -0., -20000., 0.])
+    """
+    return (rotation(attitude_deg).mT @ field_vector(elements).unsqueeze(-1)).squeeze(-1)

@@ -1,1 +1,1 @@
-"""A navigator on board one vehicle, logs of vehicles, links to autopilots. Nothing else in magrl imports it."""
+"""A navigator on board one vehicle, and readings that vehicles recorded. Nothing else in magrl imports it."""

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import td3_gradient_guided as recipe
 import torch
-from support.logs import nmea, ulog
 from support.networks import network_file
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
@@ -17,11 +16,8 @@ from magrl.files import load_tensors, save_tensors
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
 from magrl.transforms import ReadingView, load_conditions
-from magrl.vehicle.logs import Calibration, read_log
 
 MUTANTS = 80
-CALIBRATION = '{{"matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "offset_nt": [0, 0, {}], "method": "vector", '
-CALIBRATION += '"std": [0, 0, 0], "noise_nt": 1, "samples": 9, "outliers": 0, "here": [1, 2]}}'
 
 
 def mutant(whole: bytes, dice: random.Random) -> bytes:
@@ -125,8 +121,6 @@ NUMBERS: dict[str, tuple[Callable[[Path], object], str]] = {
         "date = 2026-07-01\nzeta = {}\nregion = {{latitude = [1, 2], longitude = [1, 2]}}",
     ),
     "region.toml": (load_scenario, "date = 2026-07-01\nregion = {{latitude = [1, 2], longitude = [1, {}]}}"),
-    "quay.json": (Calibration.load, CALIBRATION),
-    "log.csv": (read_log, "time,x,y,z\n0,0,0,{}"),
 }
 """Readers of numbers, and a file of each with one number left open."""
 
@@ -147,18 +141,6 @@ def test_conditions_of_a_file_have_no_keys(tmp_path: Path) -> None:
         path.write_text(f'sensors.{key} = ["field"]', encoding="utf-8")
         with pytest.raises(ValueError, match=f"^{path}: unknown key '{key}'"):
             load_conditions(path)
-
-
-CSV = b"time,mag_x_uT,mag_y_uT,mag_z_uT,roll,heading_true_rad,speed_kn,lat,lon,alt_m\n"
-CSV += b"".join(b"%d,15.5,1,48.5,2,3,10,60,5,30\n" % row for row in range(9))
-
-
-@pytest.mark.parametrize("content", [CSV, nmea(), ulog()], ids=["CSV", "NMEA", "PX4"])
-def test_logs(tmp_path: Path, content: bytes) -> None:
-    """A mutant may be another log. One of ArduPilot is not tested so: pymavlink leaves a damaged file open."""
-    path = tmp_path / "log"
-    path.write_bytes(content)
-    fuzz(path, lambda: read_log(path), lambda found: len(found.samples) > 0 and bool(found.source), 4)
 
 
 def test_policy_that_asks_for_more_than_it_holds(tmp_path: Path) -> None:

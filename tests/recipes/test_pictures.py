@@ -21,7 +21,7 @@ DOCS = RECIPES.parent / "docs"
 DRAWN = figures.DATA | {"results/scores": "results/scores.csv"}
 OTHERS = {"fig-4-1-contours", "two-elements"}  # of the field alone
 OTHERS |= {"place-error", "reliability", *(f"task-{task}" for task in pictures.NAMED_ENVS)}  # flights
-OTHERS |= {"raw_log", "plume", "cost-by-vehicles"}  # an example, a training, a benchmark
+OTHERS |= {"plume", "cost-by-vehicles"}  # a training, a benchmark
 
 
 @pytest.mark.parametrize("path", sorted(DOCS.glob("*/*.png")), ids=lambda path: path.stem)

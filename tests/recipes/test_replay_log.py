@@ -1,4 +1,4 @@
-"""The recipe that replays a log: estimates against truth, joined rows, files, and errors that name the row."""
+"""The recipe that replays a log: estimates against truth, files, and errors that name the row."""
 
 from __future__ import annotations
 
@@ -75,20 +75,6 @@ def test_the_first_position_may_be_known(tmp_path: Path, said) -> None:
             said(changed, *start, *options)
 
 
-def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
-    """Each reading is at the mean of the places of its rows; the last move may have half the length."""
-    path = tmp_path / "log.csv"
-    rows = ["0,60,20000,0,0", "0,60,20010,0,3", "0,60,20020,90,4", "0,60,20030,90,2"]
-    path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]), encoding="utf-8")
-    log = recipe.read_log(recipe.Config(path))
-    joined = recipe.joined(log, 4.0)
-    assert joined["row"].tolist() == [1, 3]
-    assert joined["B_H"].tolist() == pytest.approx([20005, 20025])
-    assert joined["distance"].tolist() == pytest.approx([0, (1.5**2 + 5**2) ** 0.5])
-    assert joined["heading"].tolist() == pytest.approx([0, 73.300756])
-    pd.testing.assert_frame_equal(recipe.joined(log, 0.0), log, check_dtype=False)
-
-
 def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(said) -> None:
     log, date = pd.read_csv(LOG)[:4], ("--date", "2025-01-01")
     text = said(log.loc[log.index.repeat(2)], *date)
@@ -134,7 +120,6 @@ def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
         (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest leg"),
         (("0.83", "20"), (), "time runs backward from row 2 to 3, from 20 to 1.67: sort the rows"),
-        (("B_H", "B_H"), ("--every-km", "5000"), "every_km 5000 leaves one reading of 4: choose shorter legs"),
         (("B_H", "B_H"), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
         (("B_H", "B_H"), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
         (("B_H", "B_H"), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),

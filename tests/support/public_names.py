@@ -14,12 +14,12 @@ PACKAGES = (
     "navigators",
     "agents",
     "vehicle.onboard",
-    "vehicle.logs",
     "evaluation",
     "training",
 )
 """Packages whose functions and classes are public."""
 MODULES = ("checks", "files", "geodesy", "guidance", "sensor_std", "envs.gymnasium", "navigators.metaheuristics")
+MODULES += ("vehicle.logs",)
 """Modules whose functions and classes are public."""
 
 

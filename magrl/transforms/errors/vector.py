@@ -9,8 +9,10 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magrl.checks import check_tensor
+from magrl.field.elements import rotation
 from magrl.transforms.errors.base import check_sizes
 
 NO_MATRIX = ((0.0, 0.0, 0.0),) * 3
@@ -81,7 +83,7 @@ class VectorErrors:
         sizes = (*self.hard_iron_nt, *(x for row in self.soft_iron for x in row), *self.attitude_deg)
         drawn = normal.new_tensor(sizes) * (torch.ones_like(normal) if self.fixed else normal)
         hard, soft, attitude = drawn.split((3, 9, 2), -1)
-        turned, one = _leveling(torch.deg2rad(attitude)), torch.eye(3, dtype=normal.dtype, device=normal.device)
+        turned, one = rotation(pad(attitude, (0, 1))), torch.eye(3, dtype=normal.dtype, device=normal.device)
         matrix = turned @ (one + soft.unflatten(-1, (3, 3))) - one
         return torch.cat((matrix.flatten(-2), (turned @ hard.unsqueeze(-1)).squeeze(-1)), -1)
 
@@ -147,11 +149,3 @@ class VectorErrors:
         constant = hard + soft * down2
         across = constant + attitude / math.degrees(1) ** 2 * down2
         return torch.stack((across, across, constant), -1).sqrt()
-
-
-def _leveling(attitude: Tensor) -> Tensor:
-    """Return the rotation that errors of roll and pitch ``(..., 2)`` [rad] leave: ``(..., 3, 3)``."""
-    (roll, pitch), zero = attitude.unbind(-1), torch.zeros_like(attitude[..., 0])
-    cr, sr, cp, sp = torch.cos(roll), torch.sin(roll), torch.cos(pitch), torch.sin(pitch)
-    rows = (cp, sp * sr, sp * cr, zero, cr, -sr, -sp, cp * sr, cp * cr)
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
