@@ -2,7 +2,7 @@
 
     python recipes/evaluate.py secant parallel                                  # without training
     python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso --out runs/comparison
-    python recipes/evaluate.py secant --scenario my.toml --export tracks.geojson    # own tasks, tracks for a map
+    python recipes/evaluate.py secant --scenario my.toml                            # own tasks
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
     python recipes/evaluate.py kalman --errors 0.05 0.05 5 --north magnetic     # without a true-north reference
@@ -31,11 +31,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magrl.envs import load_scenario, named_tasks
-from magrl.evaluation import Flight, episode_measures, export, summarize
+from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.navigators import check_distinct, label, training_settings
-from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
+from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json, write_text, write_with
 from magrl.sensor_std import PERFECT, Noise
@@ -77,8 +77,6 @@ class Config(ScenarioOptions):
     """Seed of random tasks, disjoint from the tasks of trainings and of frozen sets; 0 by default."""
     scenario: Path | None = None
     """Scenario file (.toml or .json) of region, date and tasks (docs/data.md); by default the runs' or the paper's."""
-    export: Path | None = None
-    """GeoJSON file for the tracks of all episodes (.geojson)."""
     errors: Noise | str | None = None
     """White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle.
     Vehicles are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (docs/results.md).
@@ -107,7 +105,6 @@ class Results:
     runs: list[dict[str, Any]] = field(default_factory=list)
     episodes: list[dict[str, Any]] = field(default_factory=list)
     paths: list[dict[str, Any]] = field(default_factory=list)
-    tracks: list[export.Feature] = field(default_factory=list)
     rollouts: dict[str, TensorDictBase] = field(default_factory=dict)
 
 
@@ -151,8 +148,6 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
     if not config.navigators:
         raise UsageError("name at least one navigator, for example: secant")
     try:
-        if config.export:
-            export.check_suffix(config.export)
         check_distinct(config.navigators)
         config, notes = with_training_settings(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
@@ -160,8 +155,6 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         told = ("errors", "north", "model", "start_km", "confidence", "seed", "device")
         flights = [Flight(tasks, **{key: getattr(config, key) for key in told}) for tasks in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
-        if config.export:
-            check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
@@ -176,7 +169,7 @@ def evaluate(config: Config) -> str:
     """
     torchrl_logger.setLevel("WARNING")
     config, (flight, example_flight), navigators, notes = prepare(config)
-    names, results = task_names(flight.base.scenario), Results()
+    results = Results()
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
@@ -192,8 +185,6 @@ def evaluate(config: Config) -> str:
             {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
             for task in range(flight.base.num_envs)
         ]
-        if config.export:
-            results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.rollouts[label(name)] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, example_flight.fly(example).cpu())
@@ -257,8 +248,6 @@ def write(config: Config, flight: Flight, results: Results, below: str) -> None:
     write_text(config.out / "table.md", whole + below)
     figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
     write_with(config.out / "trajectories.png", figure.savefig, dpi=120)
-    if config.export:
-        export.write_tracks(config.export, results.tracks)
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -1,8 +1,7 @@
 """Fly the pretrained agent, which has no map, between two places on Earth: seconds, and no training.
 
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W"                     # Bergen to Reykjavik
-    python recipes/fly.py "60.4N 5.3E" "D=-11.1 I=75.2 BH=13000"         # a destination by its magnetic elements
-    python recipes/fly.py "38.7, -9.1" "40.7, -74.0" --errors 0.05 0.05 5 --navigator secant --export track.geojson
+    python recipes/fly.py "38.7, -9.1" "40.7, -74.0" --errors 0.05 0.05 5 --navigator secant
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors underwater         # with the errors of a real vehicle
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors 0 0.05 5 --north magnetic  # with a compass, without D
 
@@ -23,8 +22,8 @@ from typing import Any, Literal
 
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation import Flight, episode_measures, export, places
-from magrl.evaluation.maps import trajectories_figure, write_gif
+from magrl.evaluation import Flight, episode_measures, places
+from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.navigators import needs
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
@@ -57,7 +56,7 @@ class Config:
     start: tyro.conf.Positional[str]
     """Start, such as "60.4N 5.3E", "60.4, 5.3" or "-33.9 18.4"."""
     destination: tyro.conf.Positional[str]
-    """Destination, such as a start, or by its magnetic elements: "D=-11.1 I=75.2 BH=13000" (deg, deg, nT)."""
+    """Destination, such as a start."""
     navigator: str = "anywhere"
     """Navigator: anywhere (pretrained), anywhere=RUN (a run folder), kalman, secant, ..., as in evaluate.py."""
     errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
@@ -81,12 +80,8 @@ class Config:
     """Random seed of the start heading and of the noise."""
     out: Path = Path("runs/fly")
     """Folder of flight.png and flight.json, which are replaced."""
-    export: Path | None = None
-    """GeoJSON file for the track (.geojson)."""
-    animate: Path | None = None
-    """GIF file for an animation of the flight without an arrival signal (.gif)."""
     title: str | None = None
-    """Title of the flight in its pictures, such as "Bergen to Reykjavik"; start and destination by default."""
+    """Title of the flight in its picture, such as "Bergen to Reykjavik"; start and destination by default."""
 
 
 class Watched(TensorDictModuleBase):
@@ -115,9 +110,7 @@ def ends(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
     Raises:
         ValueError: for a place that cannot be read or found, or ends between which no flight is possible.
     """
-    read = places.parse_coordinates
-    start, elements = read(config.start), places.parse_elements(config.destination)
-    target = read(config.destination) if elements is None else places.find_elements(field, elements, start)
+    start, target = map(places.parse_coordinates, (config.start, config.destination))
     distance_km = geodesic(*start, *target)[0].item()
     if math.isnan(distance_km):
         raise ValueError(f"{config.destination!r} is the antipode of the start, {config.start!r}: choose another one")
@@ -130,12 +123,8 @@ def ends(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
 
 def check_files(config: Config) -> None:
     """Raise unless all files can be written."""
-    if config.export:
-        export.check_suffix(config.export)
-    if config.animate and config.animate.suffix != ".gif":
-        raise ValueError(f"an animation must end in .gif, got {config.animate}")
-    for file in filter(None, (config.out / "flight.png", config.out / "flight.json", config.export, config.animate)):
-        check_writable(file)
+    for name in ("flight.png", "flight.json"):
+        check_writable(config.out / name)
 
 
 def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
@@ -213,14 +202,9 @@ def draw(
         f"{rule.replace('_', ' an arrival ')}: {values['outcome']}, {values['length_km']:.0f} km"
         for rule, values in measures.items()
     ]
-    title = titles[0] = f"{route}: {navigator} {titles[0]}"
+    titles[0] = f"{route}: {navigator} {titles[0]}"
     figure = trajectories_figure(dict(zip(titles, steps.values(), strict=True)), base.field, base.region)
     write_with(config.out / "flight.png", figure.savefig, dpi=120)
-    if config.export:
-        export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=navigator))
-    if config.animate:
-        end = "{outcome}, {navigation_error_km:.1f} km from the destination".format(**measures["without_signal"])
-        write_gif(config.animate, steps["without_signal"], base.field, base.region, f"{route}: {end}")
 
 
 def fly(config: Config) -> dict[str, Any]:
@@ -240,7 +224,7 @@ def fly(config: Config) -> dict[str, Any]:
     last = steps["without_signal"]["next"][0, -1]
     name = config.navigator.partition("=")[0]
     result = {
-        **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
+        **{key: value for key, value in asdict(config).items() if key != "out"},
         "navigator": name,
         "north": "true" if first.get("true_target_field", None) is None else "magnetic",  # also of a preset
         "needs": needs(name),
@@ -259,6 +243,7 @@ def summary(result: dict[str, Any]) -> str:
     """Return the result of a flight as text."""
     errors = result["errors"]
     errors = errors if isinstance(errors, str) else "{:g} deg, {:g} deg, {:g} nT".format(*errors)
+    elements = "D={:.2f} I={:.2f} BH={:.0f}".format(*result["target_field"])
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],
@@ -266,7 +251,7 @@ def summary(result: dict[str, Any]) -> str:
         "errors": errors,
         "north": result["north"],
         "start": ends[0],
-        "destination": f"{ends[1]}, {places.elements_text(torch.tensor(result['target_field']))}",
+        "destination": f"{ends[1]}, {elements}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",
         "path": f"{result['length_km']:.0f} km; the shortest is {result['shortest_km']:.0f} km",
         "efficiency": f"{100 * result['path_efficiency']:.1f} %",

@@ -1,4 +1,4 @@
-"""Maps of episodes over contours of the field: figures, and an animated GIF.
+"""Maps of episodes over contours of the field.
 
 The coastlines are from Natural Earth 4.1.0, physical vectors "Land" at 1:50 million, which are in the public domain
 (https://www.naturalearthdata.com). They were taken from ``land-50m.json`` of the npm package world-atlas 2.0.2, cut at
@@ -9,16 +9,14 @@ degree are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -26,21 +24,14 @@ from magrl.checks import check_number, check_tensor
 from magrl.envs import Region, Regions
 from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
-from magrl.evaluation.episodes import episode_measures, moved
+from magrl.evaluation.episodes import episode_measures
 from magrl.field import FieldModel
-from magrl.files import write_with
 from magrl.geodesy import geodesic, move, polar
-from magrl.tracking import Way
 
-PIECES = 4
-"""Pieces in which a leg is drawn, since a geodesic is not a straight line on the map."""
 LAND, ESTIMATE = "#8c6d46", "#56B4E9"
 """Colors of coastlines, and of estimates of the destination."""
-FRAME_MS, LAST_FRAME_MS, GIF_COLORS = 150, 1280, 256
 WAY = ("track", "way")
 """Key of the estimated displacement of a :class:`~magrl.transforms.TrackField`."""
-_DRAWN = PIECES // 2  # a frame at every second piece of a leg
-_FARTHEST = 1.3  # distance of an estimate, over the task's distance, up to which the map of an animation holds it
 
 
 @cache
@@ -107,37 +98,26 @@ def frame(positions: Tensor) -> Region:
 
 
 def episode_tracks(rollout: TensorDictBase, region: Region | Regions) -> list[Tensor]:
-    """Return the track of the first episode of each vehicle, each leg in :data:`PIECES` pieces of its geodesic.
+    """Return the track of the first episode of each vehicle.
 
     Args:
-        rollout: ``(M, T)`` from the environment.
-        region: region of the tasks.
+        rollout: ``(M, T)`` in one region.
+        region: region that gives the branch of the longitudes.
 
     Returns:
-        ``M`` tensors ``(PIECES * steps + 1, 2)``, latitude and unwrapped longitude [deg]; every ``PIECES``-th is a
-        waypoint.
-
-    Raises:
-        ValueError: for a rollout of other dimensions.
+        ``M`` tensors ``(steps + 1, 2)``, latitude and unwrapped longitude [deg].
 
     Example:
-        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
-        >>> env = GeomagneticNavEnv(seed=0)
-        >>> track, = episode_tracks(env.rollout(3), env.region)
-        >>> len(track) == 3 * PIECES + 1
-        True
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(seed=0, max_steps=3)
+        >>> (track,) = episode_tracks(env.rollout(3), env.region)
+        >>> len(track)
+        4
     """
     rollout, region = rollout.cpu(), one_region(region)
     steps = episode_measures(rollout)["steps"].tolist()
-    latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
-    share = torch.arange(PIECES, dtype=torch.float64) / PIECES
-    distance, heading = (part.unsqueeze(-1) for part in moved(rollout["next"]))
-    legs = torch.stack(move(latitude, longitude, heading, distance * share), -1)
-    legs[..., 0, :] = rollout["position"]
-    rows = zip(legs, rollout["next", "position"], steps, strict=True)
-    return [
-        region.unwrapped(torch.cat((leg[:count].flatten(0, 1), after[count - 1 : count]))) for leg, after, count in rows
-    ]
+    rows = zip(rollout["position"], rollout["next", "position"], steps, strict=True)
+    return [region.unwrapped(torch.cat((before[:1], after[:count]))) for before, after, count in rows]
 
 
 def trajectories_figure(
@@ -180,7 +160,7 @@ def trajectories_figure(
         tracks, height = _draw_map(axes, shown, field, region)
         figure.set_size_inches(8 * columns, max(figure.get_figheight(), height * rows))
         for track in tracks:
-            axes.plot(track[::PIECES, 1], track[::PIECES, 0], "-", color=PATH, lw=1.5, marker=".", ms=4)
+            axes.plot(track[:, 1], track[:, 0], "-", color=PATH, lw=1.5, marker=".", ms=4)
         axes.lines[-1].set_label("track")
         if shown.get(WAY, None) is not None:
             guesses = region.unwrapped(estimates(shown["next"].reshape(-1), 5000.0))
@@ -190,9 +170,7 @@ def trajectories_figure(
     return figure
 
 
-def _draw_map(
-    axes: Axes, rollout: TensorDictBase, field: FieldModel, region: Region, shown: Tensor | None = None
-) -> tuple[list[Tensor], float]:
+def _draw_map(axes: Axes, rollout: TensorDictBase, field: FieldModel, region: Region) -> tuple[list[Tensor], float]:
     """Draw a map of episodes without their tracks.
 
     Args:
@@ -200,14 +178,13 @@ def _draw_map(
         rollout: ``(M, T)`` from the environment.
         field: any model of :mod:`magrl.field`.
         region: region of the tasks.
-        shown: ``(P, 2)`` positions that the map must hold beside the tracks and the shortest paths [deg].
 
     Returns:
         The tracks (:func:`episode_tracks`), and the height of a figure of 8 inches.
     """
     tracks, ends = episode_tracks(rollout, region), [rollout[f"{end}_position"][:, 0] for end in ("start", "target")]
     shortest = region.unwrapped(shortest_path(*ends))
-    box = frame(torch.cat([*tracks, *shortest, region.unwrapped(ends[0][:0] if shown is None else shown)]))
+    box = frame(torch.cat([*tracks, *shortest]))
     draw_contours(axes, field, box)
     for turn in (-360, 0, 360):
         axes.plot(coastlines()[:, 1] + turn, coastlines()[:, 0], color=LAND, lw=1)
@@ -291,102 +268,3 @@ def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: f
     values, axes = torch.linalg.eigh(covariance.double())
     circle = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
     return _ends(position, way.double() + deviations * (circle * values.clamp_min(0).sqrt()) @ axes.mT)
-
-
-def write_gif(
-    path: Path | str,
-    rollout: TensorDictBase,
-    field: FieldModel,
-    region: Region | Regions,
-    title: str = "",
-    *,
-    width_px: int = 720,
-) -> None:
-    """Write episodes as an animated GIF that loops: their tracks, and the estimate of the destination of a single one.
-
-    Args:
-        path: path of the image; an existing file is replaced.
-        rollout: ``(M, T)`` from the environment; of one vehicle with a track
-            (:class:`~magrl.transforms.TrackField`), the ellipse of two standard deviations around the estimated
-            destination is drawn.
-        field: any model of :mod:`magrl.field`.
-        region: region of the episodes.
-        title: title of the map.
-        width_px: width [pixels].
-
-    Raises:
-        ValueError: for a rollout of other dimensions, or a width below 1.
-
-    Example:
-        >>> import tempfile
-        >>> from magrl.envs import GeomagneticNavEnv
-        >>> env, path = GeomagneticNavEnv(seed=0), Path(tempfile.mkdtemp()) / "episodes.gif"
-        >>> write_gif(path, env.rollout(1), env.field, env.region, width_px=200)
-        >>> path.read_bytes()[:3]
-        b'GIF'
-    """
-    check_number(1, whole=True, width_px=width_px)
-    save_gif(Path(path), list(_frames(rollout.cpu(), field, one_region(region), title, width_px)))
-
-
-def save_gif(path: Path, frames: Sequence[Image.Image], frame_ms: int = FRAME_MS, last_ms: int = LAST_FRAME_MS) -> None:
-    """Write images as an animated GIF that loops; an existing file is replaced.
-
-    Args:
-        path: path of the GIF.
-        frames: images of one size.
-        frame_ms: duration of a frame [ms].
-        last_ms: duration of the last one [ms].
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "dark.gif"
-        ...     save_gif(path, [Image.new("RGB", (8, 8), color) for color in ("white", "gray", "black")])
-        ...     with Image.open(path) as image:
-        ...         image.n_frames
-        3
-    """
-    sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])
-    palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames: unchanged pixels compress well
-    start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)
-    durations = [frame_ms] * len(others) + [last_ms]
-    write_with(path, start.save, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
-
-
-def _frames(
-    rollout: TensorDictBase, field: FieldModel, region: Region, title: str, width_px: int
-) -> Iterator[Image.Image]:
-    """Yield the frames; a vehicle that has arrived takes the color of destinations."""
-    success, states = episode_measures(rollout)["success"].tolist(), rollout[0]
-    estimated = len(rollout) == 1 and rollout.get(WAY, None) is not None
-    distance = geodesic(*states["start_position"][0], *states["target_position"][0])[0].item()
-    figure = Figure(layout="constrained")
-    canvas, axes = FigureCanvasAgg(figure), figure.add_subplot(title=title)
-    shown = estimates(states, _FARTHEST * distance) if estimated else None
-    tracks, height = _draw_map(axes, rollout, field, region, shown)
-    figure.set_size_inches(8, height)
-    figure.set_dpi((width_px + 0.01) / 8)
-    estimate = axes.plot([], [], color=ESTIMATE, lw=1.5, marker="x", ms=8, mew=2.5, markevery=[0])[0]
-    estimate.set_label("destination, estimated: 2 standard deviations" if estimated else "")
-    lines = [axes.plot([], [], lw=2, marker="o", ms=6, markevery=[-1])[0] for _ in tracks]
-    _draw_legend(figure)
-    canvas.draw()
-    figure.set_layout_engine("none")  # a fixed layout in all frames
-    for piece in range(0, max(map(len, tracks)), _DRAWN):
-        for line, track, arrives in zip(lines, tracks, success, strict=True):
-            line.set_data(*track[: piece + 1].T.flip(0).numpy())
-            line.set_color(TARGET if arrives and piece >= len(track) - 1 else PATH)
-        if estimated:
-            state = states[piece // PIECES] if piece < len(tracks[0]) - 1 else states["next"][-1]
-            estimate.set_data(*_estimate(state, region).T[::-1])
-        canvas.draw()
-        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-
-
-def _estimate(state: TensorDictBase, region: Region) -> np.ndarray:
-    """Return the estimated destination and, after a gap, its ellipse, with gaps at the edge of the map: ``(P, 2)``."""
-    position, (way, covariance) = state["position"].double(), (state[WAY][key].double() for key in Way._fields)
-    line = region.unwrapped(torch.cat((_ends(position, way[None]), way_ellipse(position, way, covariance)))).numpy()
-    jumps = np.flatnonzero(np.abs(np.diff(line[:, 1])) > 180)
-    return np.insert(line, [1, *jumps[jumps > 0] + 1], np.nan, axis=0)

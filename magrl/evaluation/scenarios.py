@@ -99,14 +99,3 @@ def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
     check_number(1, len(scenario.tasks.start), whole=True, num_tasks=num_tasks)
     tasks = Tasks(*(values[:num_tasks] for values in scenario.tasks))
     return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
-
-
-def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
-    """Return the names of frozen tasks: their own, or numbers from ``first`` on.
-
-    Example:
-        >>> task_names(first_tasks(choose_tasks(None, "paper-100"), 2))
-        ('task 0', 'task 1')
-    """
-    assert scenario.tasks is not None
-    return scenario.names or tuple(f"task {number}" for number in range(first, first + len(scenario.tasks.start)))

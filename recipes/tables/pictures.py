@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from magrl.envs.navigation import NAMED_ENVS
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
 from magrl.evaluation import Flight, episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
-from magrl.evaluation.maps import LAND, coastlines, save_gif, way_ellipse
+from magrl.evaluation.maps import LAND, coastlines, way_ellipse
 from magrl.field import IGRF, FieldModel
 from magrl.field.elements import UNITS
 from magrl.files import write_with
@@ -230,6 +230,15 @@ def draw_errors(figure: Figure, errors: Tensor) -> None:
     panels[-1].set_xlabel("step")
 
 
+def save_gif(path: Path, frames: Sequence[Image.Image]) -> None:
+    """Write images of one size as an animated GIF that loops; an existing file is replaced."""
+    sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])
+    palette = Image.fromarray(sample).quantize(COLORS)  # one for all frames: unchanged pixels compress well
+    start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)
+    durations = [FRAME_MS] * len(others) + [LAST_MS]
+    write_with(path, start.save, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+
+
 def main(out: Path = Path("docs/figures")) -> None:
     """Draw all pictures.
 
@@ -239,7 +248,7 @@ def main(out: Path = Path("docs/figures")) -> None:
     target, flights = trips()
     (reckoning, few), (filtered, many) = flights.values()
     frames = Animation(target, reckoning, filtered).frames(f"dead reckoning {few} of 100,\nmagrl {many} of 100 arrive")
-    save_gif(out / "underwater.gif", list(frames), FRAME_MS, LAST_MS)
+    save_gif(out / "underwater.gif", list(frames))
     for task in NAMED_ENVS:
         picture = image_of(task_picture(task)).quantize(COLORS)
         write_with(out / f"task-{task}.png", partial(picture.save, format="PNG"))

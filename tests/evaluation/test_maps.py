@@ -1,21 +1,18 @@
-"""Maps of episodes, and the animated GIF: positions, estimates of the destination, and frames."""
+"""Maps of episodes: positions, and estimates of the destination."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageSequence
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
-from magrl.evaluation import episode_measures, evaluation_rollout, maps
-from magrl.evaluation.maps import coastlines, trajectories_figure, way_ellipse, write_gif
+from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.evaluation.maps import coastlines, trajectories_figure, way_ellipse
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
 from magrl.transforms import TrackField
@@ -89,51 +86,3 @@ def test_ellipse_has_the_covariance_of_the_way(across: float) -> None:
     assert size.numpy() == pytest.approx(4, abs=0.02)
     assert torch.allclose(ends[0], ends[-1], atol=1e-9)
     assert offset[:, 0].max() == pytest.approx(10, abs=0.1)
-
-
-def test_gif_of_several_vehicles_shows_them_moving(env: GeomagneticNavEnv, tmp_path: Path) -> None:
-    rollout = evaluation_rollout(env, Secant(probe_km=10.0))  # moves that a picture shows: equal frames are merged
-    write_gif(tmp_path / "a.gif", rollout, env.field, env.region, width_px=320)
-    with Image.open(tmp_path / "a.gif") as picture:
-        assert picture.width == 320
-        assert picture.n_frames == 2 * int(episode_measures(rollout)["steps"].max()) + 1
-        assert (picture.info["loop"], picture.info["duration"]) == (0, maps.FRAME_MS)
-        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(picture)]
-    assert all((before != after).any() for before, after in itertools.pairwise(frames))
-    assert (frames[0] == frames[-1]).all(-1).mean() > 0.9  # the map itself stands still
-    with pytest.raises(ValueError, match="width_px must be a whole number from 1 on, got 0"):
-        write_gif(tmp_path / "b.gif", rollout, env.field, env.region, width_px=0)
-
-
-def test_gif_of_one_vehicle_holds_the_estimates_and_ends_with_the_last(flight, monkeypatch) -> None:
-    rollout, env = flight
-    rollout, drawn = rollout.clone(), []
-    rollout["track", "way", "displacement"][0] = torch.tensor([[100.0, 100.0], [500.0, 0.0], [9000.0, 0.0]])
-    rollout["next", "track", "way", "displacement"][0, -1] = torch.tensor([-300.0, 0.0])
-    keep = maps._draw_legend
-    monkeypatch.setattr(maps, "_draw_legend", lambda figure: (drawn.append(figure.axes[0]), keep(figure)))
-    assert len(list(maps._frames(rollout, env.field, env.region[0], "", 200))) == 7
-    low, high = drawn[0].get_ylim()
-    assert -17 + 4.5 < high < 20  # 500 km to the north, but not 9000 km
-    assert low < -17
-    line = next(line for line in drawn[0].lines if line.get_marker() == "x").get_ydata()
-    assert line[0] == pytest.approx(rollout["next", "position"][0, -1, 0].item() - 300 / 110.65, abs=0.02)
-    assert np.isnan(line[1])
-
-
-def test_an_ellipse_has_a_gap_at_the_edge_of_the_map(flight) -> None:
-    state = flight[0]["next"][0, -1].clone()
-    state["track", "way", "covariance"] = 4e6 * torch.eye(2)
-    line = maps._estimate(state, Region((-25, -5), (-180, 180)))
-    assert np.isnan(line).all(1).sum() > 1
-    assert np.nanmax(np.abs(np.diff(line[2:, 1]))) < 180
-
-
-def test_tracks_have_equal_pieces_on_their_geodesics_and_no_break_at_the_antimeridian(flight) -> None:
-    rollout, env = flight
-    (track,) = maps.episode_tracks(rollout, env.region[0])
-    ends = rollout["position"][0, 0, 1], rollout["next", "position"][0, -1, 1] + 360
-    assert track[[0, -1], 1].tolist() == pytest.approx([end.item() for end in ends])
-    pieces, _ = geodesic(*track[:-1].T, *track[1:].T)
-    legs, _ = geodesic(*track[: -maps.PIECES : maps.PIECES].T, *track[maps.PIECES :: maps.PIECES].T)
-    np.testing.assert_allclose(pieces.reshape(-1, 4), legs[:, None].expand(-1, 4) / maps.PIECES, atol=1e-2)

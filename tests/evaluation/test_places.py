@@ -1,19 +1,11 @@
-"""Places on Earth, from coordinates as people write them or from magnetic elements."""
+"""Places on Earth, from coordinates as people write them."""
 
 import pytest
 import torch
 
 from magrl.envs import Regions
-from magrl.evaluation.places import (
-    check_declination,
-    elements_text,
-    find_elements,
-    parse_coordinates,
-    parse_elements,
-    region_around,
-)
-from magrl.field import IGRF, elements_at
-from magrl.geodesy import geodesic
+from magrl.evaluation.places import check_declination, parse_coordinates, region_around
+from magrl.field import IGRF
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +25,6 @@ def test_coordinates() -> None:
         (" 33.9s,18.4w ", (-33.9, -18.4)),
         ("60.4° N, 5.3° E", (60.4, 5.3)),
         ("0 200", (0, -160)),
-        ("58°58'N 5°44'E", (58 + 58 / 60, 5 + 44 / 60)),
-        ("-33° 54′ 36″, 18°25.5'W", (-33.91, -18.425)),
         ("1N,181E", (1, -179)),
     ):
         assert parse_coordinates(text).tolist() == pytest.approx(expected, abs=1e-12)
@@ -42,30 +32,10 @@ def test_coordinates() -> None:
 
 def test_texts_that_are_no_place() -> None:
     """Long ones took minutes: the time of the expression grew with powers of the length."""
-    wrong = "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°60'N 5°44'E"
+    wrong = "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°58'N 5°44'E"
     for text in ("Bergen", *wrong, "1" * 30_000 + "x", "1" + " " * 30_000 + "x", "1'" * 15_000):
         with pytest.raises(ValueError, match=r"(must have|must be) .{10,150}$"):
             parse_coordinates(text)
-    assert parse_elements("60.4N 5.3E") is None
-    for text in ("D=181 I=0 BH=1", "D=0 I=91 BH=1", "D=0 I=0 BH=0"):
-        with pytest.raises(ValueError, match=f"got '{text}'"):
-            parse_elements(text)
-
-
-def test_the_nearest_place_with_some_elements(field) -> None:
-    """Rounded elements are found within 25 km; of two places with nearly the same elements, the nearest is taken."""
-    for there, near in (((64.1, -21.9), (60.4, 5.3)), ((-33.9, 151.2), (51.5, -0.1)), ((35.7, 139.7), (21.3, -157.9))):
-        elements = parse_elements(elements_text(elements_at(field, place(*there))))
-        assert geodesic(*find_elements(field, elements, place(*near)), *place(*there))[0] < 25
-    canada, russia = place(57.3, -123.4), place(60.0, 54.6)
-    elements = elements_at(field, canada)
-    assert geodesic(*find_elements(field, elements, place(50, -100)), *canada)[0] < 0.1
-    assert geodesic(*find_elements(field, elements, place(50, 30)), *russia)[0] < 300
-
-
-def test_elements_of_no_place(field) -> None:
-    with pytest.raises(ValueError, match=r"no place has D=-3.20 I=71.50 BH=60000 within .* most similar elements are"):
-        find_elements(field, place(-3.2, 71.5, 60000), place(60, 5))
 
 
 def test_region_around_two_places(field) -> None:
