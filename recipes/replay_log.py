@@ -36,10 +36,7 @@ import numpy as np
 import pandas as pd
 import torch
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
 RECIPE = "replay_log.py"
 ELEMENTS, PLACE = [*NAMES], ("latitude", "longitude")
@@ -180,69 +177,10 @@ def last_way(table: pd.DataFrame) -> Way:
     return Way(torch.tensor([last["north_km"], last["east_km"]]), torch.tensor(last["covariance"]))
 
 
-def places(table: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions from the start ``(T, 2)``, northward and eastward [km], and the turn of north ``(T,)`` [rad].
-
-    From true positions, where the log has them, else by dead reckoning, without the turn of north along the path.
-    """
-    if "latitude" in table:
-        place = torch.tensor(table[["latitude", "longitude"]].to_numpy(dtype=float))
-        distance, bearing = geodesic(*place[:1].expand_as(place).unbind(-1), *place.unbind(-1))
-        around = torch.remainder(place[:, 1] - place[0, 1] + 180, 360) - 180
-        turn = torch.deg2rad(around) * torch.sin(torch.deg2rad((place[:, 0] + place[0, 0]) / 2))
-        return torch.stack((distance * torch.cos(bearing), distance * torch.sin(bearing)), -1).numpy(), -turn.numpy()
-    heading = np.radians(table["heading"].to_numpy(dtype=float))
-    moves = table["distance"].to_numpy(dtype=float)[:, None] * np.stack((np.cos(heading), np.sin(heading)), -1)
-    return np.cumsum(moves, 0), np.zeros(len(table))
-
-
-def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return vectors ``(T, 2)`` northward and eastward, turned to the right by angles ``(T,)`` [rad]."""
-    (north, east), cos, sin = vectors.T, np.cos(angle), np.sin(angle)
-    return np.stack((cos * north - sin * east, sin * north + cos * east), -1)
-
-
 def figure(table: pd.DataFrame, title: str) -> Figure:
-    """Return a figure of the track, the estimates of the destination, and the remaining distance."""
-    drawn = Figure(figsize=(12, 5.4), layout="constrained")
-    plan, left = drawn.subplots(1, 2)
-    dots = draw_track(plan, table)
-    drawn.colorbar(dots, ax=plan, label="row of the table", shrink=0.8)
-    plan.set(xlabel="east of the start [km]", ylabel="north of the start [km]", aspect="equal", title=title)
-    draw_distance(left, table)
-    for axes in (plan, left):
-        axes.grid(alpha=0.3)
-        axes.legend(frameon=False, fontsize=8)
-    return drawn
-
-
-def draw_track(axes: Axes, table: pd.DataFrame) -> PathCollection:
-    """Draw the track, commanded headings and estimates of the destination, and return the dots of these."""
-    place, turn = places(table)
-    turn = turn + np.radians(table["north_deg"].to_numpy(dtype=float))
-    way = table[["north_km", "east_km"]].to_numpy(dtype=float)
-    steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
-    axes.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
-    arrows = {"angles": "xy", "width": 0.004, "color": "#0072B2", "label": "commanded heading"}
-    axes.quiver(place[:, 1], place[:, 0], np.sin(steer), np.cos(steer), **arrows)
-    guess = place + turned(way, turn)
-    look = {"c": np.arange(len(table)), "cmap": "viridis", "s": 18, "zorder": 3, "label": "estimated target"}
-    dots = axes.scatter(guess[:, 1], guess[:, 0], **look)
-    along, across, bearing = (x.item() for x in last_way(table).axes())
-    angle = 90 - bearing - math.degrees(turn[-1])
-    axes.add_patch(Ellipse(guess[-1, ::-1], 4 * along, 4 * across, angle=angle, fill=False, color="#D55E00"))
-    if "miss_km" in table:
-        target = place[0] + table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)[0]
-        axes.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
-    seen = np.concatenate((place, guess[len(guess) // 4 :]))
-    slack = 0.1 * (seen.max(0) - seen.min(0)) + 10
-    low, high = seen.min(0) - slack, seen.max(0) + slack
-    axes.set(xlim=(low[1], high[1]), ylim=(low[0], high[0]))
-    return dots
-
-
-def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
-    """Draw the estimated and the true distance to the destination."""
+    """Return a figure of the estimated and the true distance to the destination."""
+    drawn = Figure(layout="constrained")
+    axes = drawn.subplots()
     travelled, error = table["distance"].cumsum(), table["error_km"].to_numpy(dtype=float)
     distance = np.hypot(table["north_km"], table["east_km"])
     axes.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
@@ -250,7 +188,11 @@ def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
     if "miss_km" in table:
         axes.plot(travelled, np.hypot(table["true_north_km"], table["true_east_km"]), "k--", label="true")
         axes.plot(travelled, table["miss_km"], color="#D55E00", label="error of the estimate")
-    axes.set(xlabel="distance moved [km]", ylabel="way to the destination [km]", ylim=(0, 1.3 * distance.max()))
+    limits = {"ylim": (0, 1.3 * distance.max()), "title": title}
+    axes.set(xlabel="distance moved [km]", ylabel="distance to the destination [km]", **limits)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    return drawn
 
 
 def markdown(table: pd.DataFrame) -> str:
