@@ -82,13 +82,11 @@ def in_disc(candidate: Tensor) -> Tensor:
 class Metaheuristic(Navigator):
     """Base class of the metaheuristics: individuals as legs, the search for the best, random numbers.
 
-    A subclass initializes its state (:meth:`begin`) and computes the next generation (:meth:`evolve`). The defaults of
-    the options are from a sweep: with the highest SPL, or with a third of the readings for 0.1 % less.
+    A subclass initializes its state (:meth:`begin`) and computes the next generation (:meth:`evolve`). Its numbers are
+    class attributes, from a sweep: with the highest SPL, or with a third of the readings for 0.1 % less.
 
     Args:
         field: field model.
-        population_size: number of individuals.
-        generations: generations of the search for one leg, the random first one included.
         max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         seed: seed of the random numbers.
@@ -108,23 +106,20 @@ class Metaheuristic(Navigator):
 
     oracle, needs = True, "the field at other places"
     options = ("seed",)
+    population_size, generations = 16, 10
+    """Number of individuals; generations of the search for one leg, the random first one included."""
 
     def __init__(
         self,
         field: FieldModel,
         *,
-        population_size: int = 16,
-        generations: int = 10,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         seed: int = 0,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        check_number(2, 10_000, whole=True, population_size=population_size)
-        check_number(1, 10_000, whole=True, generations=generations)
         check_number(whole=True, seed=seed)
-        self.field, self.population_size, self.generations = field, population_size, generations
-        self.generator = torch.Generator().manual_seed(seed)
+        self.field, self.generator = field, torch.Generator().manual_seed(seed)
         self.in_keys = ["target_field", "heading", "elapsed_steps", "position", "objective_weights", "done"]
 
     @staticmethod
@@ -204,9 +199,6 @@ class GeneticAlgorithm(Metaheuristic):
 
     Args:
         field: field model.
-        tournament_size: individuals that compete to be a parent.
-        mutation_rate: share of coordinates that mutate.
-        elites: best individuals that are kept.
         options: options of :class:`Metaheuristic`.
 
     Source:
@@ -224,20 +216,8 @@ class GeneticAlgorithm(Metaheuristic):
     name, label = "ga", "GA"
     description = "GA, look-ahead (an oracle)"
 
-    def __init__(
-        self,
-        field: FieldModel,
-        *,
-        tournament_size: int = 2,
-        mutation_rate: float = 0.3,
-        elites: int = 1,
-        **options: Any,
-    ) -> None:
-        super().__init__(field, **options)
-        check_number(1, 10_000, whole=True, tournament_size=tournament_size)
-        check_number(0, 1, mutation_rate=mutation_rate)
-        check_number(0, self.population_size - 1, whole=True, elites=elites)
-        self.tournament_size, self.mutation_rate, self.elites = tournament_size, mutation_rate, elites
+    tournament_size, mutation_rate, elites = 2, 0.3, 1
+    """Individuals that compete to be a parent, share of coordinates that mutate, best individuals that are kept."""
 
     def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate) -> dict[str, Tensor]:  # noqa: ARG002
         population = state["population"]
@@ -263,9 +243,6 @@ class ParticleSwarm(Metaheuristic):
 
     Args:
         field: field model.
-        inertia: share of its velocity that a particle keeps.
-        cognitive: pull to the best place of the particle.
-        social: pull to the best place of the swarm.
         options: options of :class:`Metaheuristic`.
 
     Source:
@@ -283,19 +260,8 @@ class ParticleSwarm(Metaheuristic):
     name, label = "pso", "PSO"
     description = "PSO, look-ahead (an oracle)"
 
-    def __init__(
-        self,
-        field: FieldModel,
-        *,
-        inertia: float = 0.7,
-        cognitive: float = 1.5,
-        social: float = 1.5,
-        **options: Any,
-    ) -> None:
-        super().__init__(field, **options)
-        check_number(0, 2, inertia=inertia)
-        check_number(0, 10, cognitive=cognitive, social=social)
-        self.inertia, self.cognitive, self.social = inertia, cognitive, social
+    inertia, cognitive, social = 0.7, 1.5, 1.5
+    """Share of its velocity that a particle keeps, pull to the best place of the particle, and to that of the swarm."""
 
     def begin(self, population: Tensor) -> dict[str, Tensor]:
         lowest = torch.full_like(population[..., 0], math.inf)
@@ -318,13 +284,7 @@ class ArtificialFishSwarm(Metaheuristic):
 
     Args:
         field: field model.
-        visual: range of sight of a fish, in longest legs.
-        step: longest step of a fish, in longest legs.
-        crowding: share of the population near a place above which that place is crowded.
-        tries: places that a preying fish evaluates before it steps at random.
-        population_size: number of fish.
-        generations: as of :class:`Metaheuristic`.
-        options: further options of it.
+        options: options of :class:`Metaheuristic`.
 
     Source:
         X. Li, Z. Shao and J. Qian, An optimizing method based on autonomous animats: fish-swarm algorithm, Systems
@@ -334,7 +294,7 @@ class ArtificialFishSwarm(Metaheuristic):
     Example:
         >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> moved = env.rollout(1, ArtificialFishSwarm(env.field, population_size=4, generations=2))
+        >>> moved = env.rollout(1, ArtificialFishSwarm(env.field))
         >>> (moved["next", "objective"] < moved["objective"]).all()
         tensor(True)
     """
@@ -342,23 +302,10 @@ class ArtificialFishSwarm(Metaheuristic):
     name, label = "afsa", "AFSA"
     description = "AFSA, look-ahead (an oracle)"
 
-    def __init__(
-        self,
-        field: FieldModel,
-        *,
-        visual: float = 0.5,
-        step: float = 1.0,
-        crowding: float = 0.6,
-        tries: int = 3,
-        population_size: int = 8,
-        generations: int = 6,
-        **options: Any,
-    ) -> None:
-        super().__init__(field, population_size=population_size, generations=generations, **options)
-        check_number(1e-6, 10, visual=visual, step=step)
-        check_number(0, 1, crowding=crowding)
-        check_number(1, 1000, whole=True, tries=tries)
-        self.visual, self.step, self.crowding, self.tries = visual, step, crowding, tries
+    population_size, generations = 8, 6
+    visual, step, crowding, tries = 0.5, 1.0, 0.6, 3
+    """Range of sight and longest step of a fish, in longest legs; share of the population near a place above which that
+    place is crowded; places that a preying fish evaluates before it steps at random."""
 
     def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate) -> dict[str, Tensor]:
         fish = state["population"]

@@ -293,8 +293,8 @@ def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch)
     monkeypatch.setattr(sys.modules["magrl.tracking.destination"], "_STEPS", 1)
     arrival = "declared" if name in ("anywhere", "dead_reckoning") else "objective"
     env = GeomagneticNavEnv(num_envs=2, seed=0, arrival=arrival)
-    small = {"generations": 2, "population_size": 3} if issubclass(NAVIGATORS[name], Metaheuristic) else {}
-    navigator = NAVIGATORS[name].for_env(env, **small)
+    monkeypatch.setattr(Metaheuristic, "generations", 2)
+    navigator = NAVIGATORS[name].for_env(env)
     if name == "dead_reckoning":
         navigator = navigator.fitted(env, {"model": earth_model("IGRF-13", "2022-01-01")})
     seen = env.reset().update({key: torch.zeros(2, 3) for key in STD_KEYS})
