@@ -53,11 +53,6 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
         torch.Size([2, 3])
     """
     restart(env)
-    return next_rollout(env, policy)
-
-
-def next_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
-    """Return the next episode of each vehicle, without exploration or gradients."""
     if not callable(policy):
         raise TypeError(f"policy must be callable with a TensorDict, got {policy!r}")
     if isinstance(policy, Navigator):
@@ -79,7 +74,7 @@ def next_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():
         lost = failed.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
-        warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=3)
+        warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=2)
     return rollout
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Any, TypeAlias
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from magrl.checks import check_choice, check_device
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, next_rollout, restart
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout
 from magrl.evaluation.navigators import fitted, make_navigator
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import EarthModel, earth_model
@@ -149,8 +148,7 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
             trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.
-        options: of :class:`Flight`, such as ``errors``. With fewer vehicles than tasks (``num_envs``), each flies
-            several. Errors and random start headings depend on their number, the tasks do not.
+        options: of :class:`Flight`, such as ``errors``. All tasks are flown at once: split a set that is too large.
 
     Returns:
         ``(M,)``, one row for each task in its order, with the measures of
@@ -163,17 +161,12 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
             its range.
 
     Example:
-        >>> episodes = evaluate("secant", "paper-100", num_envs=30)
+        >>> episodes = evaluate("secant", "paper-100")
         >>> episodes.shape, episodes["success"].double().mean()
         (torch.Size([100]), tensor(1., dtype=torch.float64))
     """
-    scenario = _with_tasks(tasks)
-    flight = Flight(scenario, **options)
-    navigator = flight.navigator(policy)
-    env, count = flight.env, len(scenario.tasks.start)  # type: ignore[union-attr]
-    restart(env)
-    episodes = [_next_episodes(env, navigator) for _ in range(math.ceil(count / env.num_envs))]
-    return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again
+    flight = Flight(_with_tasks(tasks), **options)
+    return TensorDict(episode_measures(flight.fly(policy)), [flight.base.num_envs])
 
 
 def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
@@ -183,13 +176,3 @@ def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
     if scenario.tasks is None:
         raise ValueError("the scenario has no tasks to fly: scenario.with_tasks(scenario.random_tasks(300, seed=0))")
     return scenario
-
-
-def _next_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
-    """Return the measures of the next episode of each vehicle, ``(num_envs,)``, and count exactly this episode."""
-    base = getattr(env, "base_env", env)
-    before = base.episode
-    measures = episode_measures(next_rollout(env, policy))
-    base.episode = before
-    env.reset()
-    return TensorDict(measures, [env.num_envs])
