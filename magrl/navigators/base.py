@@ -120,6 +120,7 @@ class Navigator(TensorDictModuleBase):
         self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
         self.out_keys = ["action"]
         self.memory: TensorDictBase | None = None
+        self._remembers = False
 
     @property
     def declares(self) -> bool:
@@ -173,13 +174,17 @@ class Navigator(TensorDictModuleBase):
         if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done
             memory["over"] = memory["over"] | seen["done"].squeeze(-1)
             memory["action"] = torch.where(memory["over"].unsqueeze(-1), 0.0, memory["action"])
-        rows = ((step != memory["decided_at"]) & ~memory["over"]).nonzero().squeeze(-1)
+        mark = _mark(seen.select(*self.in_keys).exclude("done"))
+        repeated = (step == memory["decided_at"]) & (mark == memory["mark"]).all(-1)
+        if self._remembers and (~repeated & ~memory["over"] & (memory["decided_at"] >= step)).any():
+            raise RuntimeError(f"{self.label} remembers other vehicles: each environment needs a navigator of its own")
+        rows = (~repeated & ~memory["over"]).nonzero().squeeze(-1)
         if len(rows):
             part = memory[rows]
             chosen = self.decide(seen[rows], part)
             action = chosen if isinstance(chosen, Tensor) else torch.stack(chosen, -1)
             part["action"] = action.to(part["action"].dtype)
-            part["decided_at"] = step[rows]
+            part["decided_at"], part["mark"] = step[rows], mark[rows]
             memory[rows] = part
         for key in self.out_keys:
             tensordict.set(key, memory[key].clone())
@@ -194,10 +199,18 @@ class Navigator(TensorDictModuleBase):
         common = {"action": torch.zeros(len(step), self.action_size, dtype=torch.float32, device=step.device)}
         common |= {"decided_at": torch.full_like(step, -1), "field_readings": torch.zeros_like(step)}
         common |= {"over": torch.zeros_like(step, dtype=torch.bool)}
-        first = TensorDict(self.first_memory(seen) | common, batch_size=step.shape, device=step.device)
+        common |= {"mark": torch.zeros_like(_mark(seen.select(*self.in_keys).exclude("done")))}
+        own = self.first_memory(seen)
+        self._remembers = bool(own)
+        first = TensorDict(own | common, batch_size=step.shape, device=step.device)
         return torch.where(step == 0, first, memory) if memory is not None and known else first
 
     @property
     def field_readings(self) -> Tensor:
         """``(N,)`` int64: readings of the field in this episode at places where the vehicle has not been."""
         return torch.zeros(0, dtype=torch.int64) if self.memory is None else self.memory["field_readings"]
+
+
+def _mark(seen: TensorDictBase) -> Tensor:
+    """Return all that vehicles see ``(N, K)``, by which a second call for one step is told from another batch."""
+    return torch.cat([value.double().flatten(1) for value in seen.values(True, True)], -1).nan_to_num()

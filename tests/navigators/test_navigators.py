@@ -307,3 +307,17 @@ def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch)
         navigator.decide(there, TensorDict(memory | navigator.first_memory(there), 2))
 
     check_one_device(monkeypatch, navigator, decide)
+
+
+@pytest.mark.parametrize("name", ["secant", "kalman", "memory", "geodesic"])
+def test_a_navigator_never_gives_the_actions_of_other_vehicles(name: str) -> None:
+    """One with a memory refuses a second environment; another one decides anew."""
+    one, other = (GeomagneticNavEnv(num_envs=4, seed=seed).rollout(2) for seed in (1, 2))
+    shared, own = (make_navigator(name, GeomagneticNavEnv(num_envs=4, seed=0)) for _ in range(2))
+    shared(one[:, 0].clone())
+    shared(one[:, 1].clone())
+    if name != "geodesic":
+        with pytest.raises(RuntimeError, match="remembers other vehicles"):
+            shared(other[:, 1].clone())
+    else:
+        assert torch.equal(shared(other[:, 1].clone())["action"], own(other[:, 1].clone())["action"])
