@@ -61,36 +61,36 @@ mutate: $(VENV)/.installed-dev  ## try random mutants of the code, 40 or ARGS="-
 	$(RUN)/python -m benchmarks.mutants $(ARGS)
 
 # Tables and figures. Runs that exist are used again; `make -j2` trains and makes two at a time, with one thread each.
-ONE := OMP_NUM_THREADS=1 $(RECIPE)
+ONE := OMP_NUM_THREADS=1 $(RUN)/python
 FIVE := 0 1 2 3 4
 AGENTS := $(foreach run,td3_gradient_guided-fast td3_gradient_guided-fast-no-cost td3-fast td3-fast-cost,$(FIVE:%=$(run)-seed%))
 RUNS_table-comparison := $(AGENTS)
 RUNS_figure-learning := $(AGENTS)
 RUNS_table-noise := $(foreach run,td3_gradient_guided-fast td3_gradient_guided-fast-noise,$(FIVE:%=$(run)-seed%))
 RUNS_table-paper-run := td3_gradient_guided-paper-seed0 td3-paper-seed0
-TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
+TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' docs/tables/tables.toml)
 FIGURES ?= place-error section-4 learning conditions two-elements reliability
 
 tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
-	$(RECIPE)/tables/publish.py README.md $(wildcard docs/*.md)
+	$(RUN)/python docs/tables/publish.py README.md $(wildcard docs/*.md)
 
 figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="place-error"; section-4 after table comparison
 
 .SECONDARY:  # keep the runs
 .SECONDEXPANSION:
 table-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_$$@)))
-	$(ONE)/tables/grid.py $* --out docs/results
+	$(ONE) docs/tables/grid.py $* --out docs/results
 
 figure-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_$$@)))
-	$(ONE)/tables/figures.py $*
+	$(ONE) docs/tables/figures.py $*
 
 pictures: $(VENV)/.installed  ## draw the pictures of the README; two minutes
-	$(ONE)/tables/pictures.py
+	$(ONE) docs/tables/pictures.py
 
 # Trainings: name of the run, recipe and options.
 define training
 runs/$(1)-seed%/eval.json: | $(VENV)/.installed
-	$(ONE)/$(2) --seed $$* --out $$(@D)
+	$(ONE) recipes/$(2) --seed $$* --out $$(@D)
 endef
 $(eval $(call training,td3_gradient_guided-fast,td3_gradient_guided.py))
 $(eval $(call training,td3_gradient_guided-fast-no-cost,td3_gradient_guided.py --distance-cost 0))

@@ -20,9 +20,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import places
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation import Flight, episode_measures, places
+from magrl.evaluation import Flight, episode_measures
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.navigators import needs
 from magrl.field import IGRF

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT / "recipes"), str(ROOT / "docs" / "tables")]
 
 # Every run checks the same examples, so that a failure is a change in the code. HYPOTHESIS_PROFILE=search draws others.
 settings.register_profile("ci", derandomize=True, max_examples=25, deadline=None, database=None)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -26,6 +27,18 @@ OpenLog = Callable[..., CurveLog]
 COUNTS = ("frames", "episodes", "iterations", "updates")
 RETURN_TERMS = ("destination", "proximity", "alignment")
 """Terms of the reward whose sums over an episode are reported beside the return."""
+LINES = ("#0072B2", "#D55E00", "#009E73")
+TRAINING_PANELS = {
+    "return": {"return": "return"},
+    "return by term": {f"return_{term}": term for term in RETURN_TERMS},
+    "success [%]": {
+        "success_rate": "SR, last 200 episodes",
+        "eval_success_rate": "SR, evaluation",
+        "eval_spl": "SPL, evaluation",
+    },
+    "loss": {"loss_critic": "critics", "loss_actor": "actor"},
+}
+"""Curves of each panel: label by column of ``train.csv``. Returns are means over the last 200 episodes."""
 
 
 class TrainingStatistics:
@@ -236,3 +249,39 @@ class RunLog:
     def close(self) -> None:
         """Close the logger."""
         self._log.close()
+
+
+def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
+    """Return the curves of one training: return, return by term, success rate and SPL, losses.
+
+    Args:
+        rows: rows of a ``train.csv``; missing values and NaN are left out.
+
+    Raises:
+        ValueError: for no row, or a row without ``frames``.
+
+    Example:
+        >>> rows = [{"frames": 1000, "return": -5.0}, {"frames": 2000, "return": 20.0, "success_rate": 10.0}]
+        >>> [axes.get_title() for axes in training_figure(rows).axes]
+        ['return', 'return by term', 'success [%]', 'loss']
+    """
+    if not rows or not all("frames" in row for row in rows):
+        raise ValueError(f"each row of a training must have frames, got {list(rows)[:1]}")
+    from matplotlib.figure import Figure  # slow to import
+    from matplotlib.ticker import EngFormatter
+
+    figure = Figure(figsize=(10, 7), layout="constrained")
+    frames = np.array([row["frames"] for row in rows])
+    for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
+        for color, (column, label) in zip(LINES, columns.items(), strict=False):
+            values = np.array([row.get(column, np.nan) for row in rows], dtype=float)
+            finite = np.isfinite(values)
+            axes.plot(frames[finite], values[finite], color=color, lw=1.2, label=label)
+        axes.set_title(title)
+        axes.grid(alpha=0.3)
+        if len(columns) > 1:
+            axes.legend(fontsize=8)
+    for axes in figure.axes[2:]:
+        axes.set_xlabel("frames (vehicle-steps)")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return figure

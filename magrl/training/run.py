@@ -35,7 +35,7 @@ from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RunConfig
-from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
+from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
 from magrl.training.loggers import open_log
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
@@ -321,13 +321,13 @@ class Run:
         Raises:
             SystemExit: after a signal, with its exit code; the policy so far is saved.
         """
-        from magrl.evaluation import figures, maps  # matplotlib is slow to import
+        from magrl.evaluation import maps  # matplotlib is slow to import
 
         seconds = self.log.seconds
         self._network.load_state_dict(self.best.weights or self._network.state_dict())
         save_policy(self.folder / "policy.safetensors", self.policy)
         if self.log.rows:
-            self.log.figure("training", figures.training_figure(self.log.rows))
+            self.log.figure("training", training_figure(self.log.rows))
         if not self.complete:
             self._report_stop()
         rollout = evaluation_rollout(test, self.policy)

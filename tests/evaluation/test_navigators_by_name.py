@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from plots import NAVIGATOR_COLORS
 from support.networks import network_file
 from torchrl.envs import StepCounter, TransformedEnv
 
 from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.evaluation.figures import NAVIGATOR_COLORS
 from magrl.evaluation.navigators import (
     NAVIGATOR_NAMES,
     TRAINED,

@@ -28,7 +28,7 @@ from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
 from magrl.envs.navigation import NAMED_ENVS
 from magrl.transforms import CONDITIONS
 
-flights, publish = load("tables/flights"), load("tables/publish")
+flights, publish = load("docs/tables/flights"), load("docs/tables/publish")
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}

@@ -1,25 +1,21 @@
 """Tables and figures from their declarative files: flights and cells by hand, and files that are named."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import figures
+import flights
+import grid
+import publish
 import pytest
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
-from support.recipes import RECIPES
 from tensordict import TensorDict
 
 from magrl import benchmark
 from magrl.benchmark import COLUMNS, LEVELS, read_episodes
 from magrl.training import UsageError
-
-sys.path.insert(0, str(RECIPES / "tables"))
-import figures
-import flights
-import grid
-import publish
 
 
 def rows(table: str) -> list[list[str]]:

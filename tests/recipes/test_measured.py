@@ -12,7 +12,7 @@ from magrl.field import IGRF
 from magrl.field.elements import measured_elements
 from magrl.geodesy import move
 
-recipe = load("tables/measured")
+recipe = load("docs/tables/measured")
 SHIFT = torch.tensor([0.1, 0.05, -120.0], dtype=torch.float64)
 """Constant difference of the measured field from IGRF."""
 

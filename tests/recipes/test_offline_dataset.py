@@ -17,7 +17,7 @@ from magrl.envs import PUBLIC_KEYS
 from magrl.training import UsageError
 
 minari = pytest.importorskip("minari")
-recipe = load("../docs/examples/offline_dataset")
+recipe = load("docs/examples/offline_dataset")
 SMALL = ["--regions", "2", "--episodes", "3", "--distance-range-km", "60", "90", "--max-steps", "4", "--seed", "1"]
 
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-
+import figures
+import flights
 import numpy as np
+import pictures
 import pytest
 import torch
 from PIL import Image, ImageSequence
-from support.recipes import RECIPES
+from support.recipes import ROOT
 
 from magrl.transforms.areas import NUMBER
 
-sys.path.insert(0, str(RECIPES / "tables"))
-import figures
-import flights
-import pictures
-
-DOCS = RECIPES.parent / "docs"
+DOCS = ROOT / "docs"
 DRAWN = figures.DATA | {"results/scores": "results/scores.csv"}
 OTHERS = {"fig-4-1-contours", "two-elements"}  # of the field alone
 OTHERS |= {"place-error", "reliability", *(f"task-{task}" for task in pictures.NAMED_ENVS)}  # flights

@@ -79,7 +79,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
 
 @pytest.mark.usefixtures("without_figures")
 def test_ppo_among_the_examples_trains(tmp_path: Path) -> None:
-    ppo = load("../docs/examples/ppo")
+    ppo = load("docs/examples/ppo")
     assert ppo.train(small(ppo, tmp_path / "run", total_frames=64))["updates"] == 2
     assert evaluate(str(tmp_path / "run" / "policy.safetensors"), "figure-4-1", max_steps=2).shape == (1,)
 

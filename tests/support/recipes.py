@@ -7,12 +7,13 @@ from types import ModuleType
 
 from magrl.training import RunConfig
 
-RECIPES = Path(__file__).parent.parent.parent / "recipes"
+ROOT = Path(__file__).parents[2]
+TABLES = ROOT / "docs" / "tables"
 
 
 def load(name: str) -> ModuleType:
-    """Return a recipe, such as ``tables/grid``, as a module."""
-    spec = importlib.util.spec_from_file_location(Path(name).name, RECIPES / f"{name}.py")
+    """Return a script, such as ``docs/tables/grid``, as a module."""
+    spec = importlib.util.spec_from_file_location(Path(name).name, ROOT / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

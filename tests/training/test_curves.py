@@ -9,7 +9,14 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from magrl.training.curves import BestPolicy, RunLog, TrainingStatistics, selection_score
+from magrl.training.curves import (
+    RETURN_TERMS,
+    BestPolicy,
+    RunLog,
+    TrainingStatistics,
+    selection_score,
+    training_figure,
+)
 from magrl.training.loggers import CurveLog
 
 
@@ -83,3 +90,15 @@ def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
         log.row({"unknown_column": 1.0})
     log.close()
     assert {path.name for path in tmp_path.iterdir()} == {"train.csv"}
+
+
+def test_training_figure_shows_the_columns_of_a_training() -> None:
+    """Return, its terms, success and losses, each from its column; the labels tell lines of a panel apart."""
+    columns = ["return", *(f"return_{term}" for term in RETURN_TERMS), "success_rate", "eval_success_rate", "eval_spl"]
+    columns += ["loss_critic", "loss_actor"]
+    rows = [{"frames": 0.0, "return": math.nan}]  # a row without values is left out
+    rows += [{"frames": frames, **{key: 10.0 * i + frames for i, key in enumerate(columns)}} for frames in (1, 2)]
+    panels = training_figure(rows).axes
+    shown = [[line.get_ydata()[0] for line in axes.lines] for axes in panels]
+    assert shown == [[1], [11, 21, 31], [41, 51, 61], [71, 81]]
+    assert [text.get_text() for text in panels[1].get_legend().get_texts()] == list(RETURN_TERMS)

@@ -1,7 +1,7 @@
 """What a memory has learned: agents of ppo_memory.py and filters, on the task of a training and under other errors.
 
-    python recipes/tables/sweep.py --algorithms ppo_memory    # the agents
-    python recipes/tables/memory.py                           # five minutes
+    python docs/tables/sweep.py --algorithms ppo_memory    # the agents
+    python docs/tables/memory.py                           # five minutes
 
 Cells are the SPL [%] of the 200 episodes of a named task (:func:`magrl.evaluation.score`), of several agents the mean
 and the range. *Storm* is in the record of its weather, and in four others; *Readings* also has the errors of a ship and
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bars import BARS
 from magrl import paper
 from magrl.envs import planet_scenario
 from magrl.envs.navigation import storm_errors
@@ -27,7 +28,6 @@ from magrl.transforms import CONDITIONS
 
 import torch
 import tyro
-from bars import BARS
 from torch import Tensor
 
 TRAINED = {"storm": "memory, trained on storm", "readings": "memory, trained on readings"}
@@ -99,7 +99,7 @@ def main(config: Config) -> None:
     """Fly all agents and write the table."""
     agents = {label: trained(config.runs, task) for task, label in TRAINED.items()}
     if not any(agents.values()):
-        raise UsageError(f"{config.runs} has no agents: python recipes/tables/sweep.py --algorithms ppo_memory")
+        raise UsageError(f"{config.runs} has no agents: python docs/tables/sweep.py --algorithms ppo_memory")
     agents |= {label: [name] for name, label in OTHERS.items()}
     tasks = columns()
     cells = {

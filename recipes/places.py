@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 
-import torch
-from torch import Tensor
-
 from magrl.checks import short
 from magrl.envs import Region, Regions
 from magrl.envs.specs import field_bounds
 from magrl.field import FieldModel, elements_at
 from magrl.geodesy import geodesic, wrap_longitude
+
+import torch
+from torch import Tensor
 
 LEAST_INTENSITY_NT = 2000.0
 """Lowest horizontal intensity of a place: nearer to a magnetic pole, the declination is hardly defined."""

@@ -1,6 +1,6 @@
 """Bars of the named tasks: what navigators without training reach on the first episode of 200 vehicles.
 
-    python recipes/tables/bars.py    # a minute; prints them with their returns
+    python docs/tables/bars.py    # a minute; prints them with their returns
 
 The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 200 vehicles starts the same episodes. Oracles are
 the true bearing, which knows where vehicle and destination are, and the shortest paths around no-go areas, all or those

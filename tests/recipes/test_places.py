@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from places import check_declination, parse_coordinates, region_around
 
 from magrl.envs import Regions
-from magrl.evaluation.places import check_declination, parse_coordinates, region_around
 from magrl.field import IGRF
 
 

@@ -1,6 +1,6 @@
 """Draw the pictures of the README: an underwater vehicle in an unknown current, and an episode of each named task.
 
-    python recipes/tables/pictures.py    # docs/figures/underwater.gif and task-*.png; two minutes
+    python docs/tables/pictures.py    # docs/figures/underwater.gif and task-*.png; two minutes
 
 The flights of the animation are those of the listing "Simulate your vehicle" of docs/vehicles.md: 100 tasks by dead
 reckoning and by kalman, of which it shows one that dead reckoning misses.

@@ -1,32 +1,18 @@
-"""Figures of trainings and evaluations show the data that they are given."""
+"""Figures of the documentation show the data that they are given."""
 
 import math
 
+import plots
 import pytest
 
 from magrl.envs import named_tasks
-from magrl.evaluation import figures
 from magrl.field import IGRF
-
-TERMS = ("destination", "proximity", "alignment")
-
-
-def test_training_figure_shows_the_columns_of_a_training() -> None:
-    """Return, its terms, success and losses, each from its column; the labels tell lines of a panel apart."""
-    columns = ["return", *(f"return_{term}" for term in TERMS), "success_rate", "eval_success_rate", "eval_spl"]
-    columns += ["loss_critic", "loss_actor"]
-    rows = [{"frames": 0.0, "return": math.nan}]  # a row without values is left out
-    rows += [{"frames": frames, **{key: 10.0 * i + frames for i, key in enumerate(columns)}} for frames in (1, 2)]
-    panels = figures.training_figure(rows).axes
-    shown = [[line.get_ydata()[0] for line in axes.lines] for axes in panels]
-    assert shown == [[1], [11, 21, 31], [41, 51, 61], [71, 81]]
-    assert [text.get_text() for text in panels[1].get_legend().get_texts()] == list(TERMS)
 
 
 def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
     """Two runs, of which one ends earlier and one has a gap; a navigator without values has no line."""
     runs = [([0, 100], [0.0, 50.0]), ([0, 50, 80], [10.0, math.nan, 90.0])]
-    axes = figures.learning_curves({"td3": runs, "gg_td3": [([0], [math.nan])]}, "SPL [%]", points=3).axes[0]
+    axes = plots.learning_curves({"td3": runs, "gg_td3": [([0], [math.nan])]}, "SPL [%]", points=3).axes[0]
     (mean,) = [line for line in axes.lines if line.get_label() == "TD3, 2 seeds"]
     assert mean.get_xdata().tolist() == [0, 40, 80]
     assert mean.get_ydata().tolist() == [5, 35, 65]
@@ -36,11 +22,11 @@ def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
 def test_figures_of_the_example_task() -> None:
     """The destination is a dashed line in each element; moves are counted from the first."""
     task, values = named_tasks("figure-4-1"), {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0]}
-    panels = figures.convergence({"secant": values | {"L": [0.0, 50.0]}}, IGRF("2022-01-01"), task).axes
+    panels = plots.convergence({"secant": values | {"L": [0.0, 50.0]}}, IGRF("2022-01-01"), task).axes
     assert [len(axes.lines) for axes in panels] == [2, 2, 2, 1]
     assert panels[3].lines[0].get_xydata().tolist() == [[1, 50]]
     assert panels[1].lines[1].get_ydata()[0] == pytest.approx(-26.92, abs=0.1)
-    lines = figures.compared_trajectories({"secant": ([-2.0, -9.0], [162.0, 164.0])}, IGRF("2022-01-01"), task).axes[0]
+    lines = plots.compared_trajectories({"secant": ([-2.0, -9.0], [162.0, 164.0])}, IGRF("2022-01-01"), task).axes[0]
     shown = {line.get_label(): line.get_xydata() for line in lines.lines}
     assert shown["secant"].tolist() == [[162, -2], [164, -9]]
     assert shown["start"].tolist() == [[162, -2]]
@@ -49,6 +35,6 @@ def test_figures_of_the_example_task() -> None:
 
 def test_boxes_hold_the_finite_values() -> None:
     measures = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
-    axes = figures.box_plots({"gg_td3": {key: [1.0, math.nan, 3.0] for key in measures}}).axes
+    axes = plots.box_plots({"gg_td3": {key: [1.0, math.nan, 3.0] for key in measures}}).axes
     assert [text.get_text() for text in axes[0].get_xticklabels()] == ["GG TD3"]
     assert [line.get_ydata().tolist() for line in axes[3].lines if line.get_marker() == "^"] == [[2]]

@@ -1,6 +1,6 @@
 """Insert measured tables into documents, so that no figure there is typed by hand.
 
-    python recipes/tables/publish.py README.md docs/reproduction.md
+    python docs/tables/publish.py README.md docs/reproduction.md
 
 A document marks the place and the file of a table by `<!-- table: docs/results/NAME.md -->` and `<!-- end -->`. Names
 of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator | SPL % -->`, leave out the others. With

@@ -1,8 +1,8 @@
-"""Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks and runs.
+"""Make the tables that docs/tables/tables.toml declares: navigators by errors, tasks and runs.
 
-    python recipes/tables/grid.py earth known --out docs/results  # writes earth.md, earth.csv.gz, ...
-    python recipes/tables/grid.py earth --navigators mine.onnx    # the same table of other navigators
-    python recipes/tables/grid.py earth --tasks 200               # faster
+    python docs/tables/grid.py earth known --out docs/results  # writes earth.md, earth.csv.gz, ...
+    python docs/tables/grid.py earth --navigators mine.onnx    # the same table of other navigators
+    python docs/tables/grid.py earth --tasks 200               # faster
 
 Without --out, tables are printed. Navigators are given the accuracy of their sensors. Tables of trained agents read
 the run folders that they name; `make tables` trains what is missing.
@@ -33,11 +33,10 @@ import tyro
 from pandas import read_csv
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
-sys.path.insert(0, str(Path(__file__).parent))
-from evaluate import Config, evaluate
-
+sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
 from flights import MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of
+
+from evaluate import Config, evaluate
 
 RECIPE = "grid.py"
 FILE, RUNS = Path(__file__).parent / "tables.toml", Path("runs")

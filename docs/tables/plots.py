@@ -1,4 +1,4 @@
-"""Figures of trainings and evaluations: functions from data to matplotlib figures, which read and write no files.
+"""Figures of the documentation: functions from data to matplotlib figures, which read and write no files.
 
 A navigator has the same color in every figure.
 """
@@ -9,12 +9,6 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
-import numpy as np
-import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
-
 from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
 from magrl.evaluation.navigators import KINDS, NAVIGATOR_NAMES
@@ -22,55 +16,16 @@ from magrl.evaluation.navigators import label as navigator_label
 from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
 
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
 _COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
 _COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
 NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
 """Color of each navigator in every figure."""
-LINES = ("#0072B2", "#D55E00", "#009E73")
-TRAINING_PANELS = {
-    "return": {"return": "return"},
-    "return by term": {f"return_{term}": term for term in ("destination", "proximity", "alignment")},
-    "success [%]": {
-        "success_rate": "SR, last 200 episodes",
-        "eval_success_rate": "SR, evaluation",
-        "eval_spl": "SPL, evaluation",
-    },
-    "loss": {"loss_critic": "critics", "loss_actor": "actor"},
-}
-"""Curves of each panel: label by column of ``train.csv``. Returns are means over the last 200 episodes."""
-
-
-def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
-    """Return the curves of one training: return, return by term, success rate and SPL, losses.
-
-    Args:
-        rows: rows of a ``train.csv``; missing values and NaN are left out.
-
-    Raises:
-        ValueError: for no row, or a row without ``frames``.
-
-    Example:
-        >>> rows = [{"frames": 1000, "return": -5.0}, {"frames": 2000, "return": 20.0, "success_rate": 10.0}]
-        >>> [axes.get_title() for axes in training_figure(rows).axes]
-        ['return', 'return by term', 'success [%]', 'loss']
-    """
-    if not rows or not all("frames" in row for row in rows):
-        raise ValueError(f"each row of a training must have frames, got {list(rows)[:1]}")
-    figure = Figure(figsize=(10, 7), layout="constrained")
-    frames = np.array([row["frames"] for row in rows])
-    for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
-        for color, (column, label) in zip(LINES, columns.items(), strict=False):
-            values = np.array([row.get(column, np.nan) for row in rows], dtype=float)
-            finite = np.isfinite(values)
-            axes.plot(frames[finite], values[finite], color=color, lw=1.2, label=label)
-        axes.set_title(title)
-        axes.grid(alpha=0.3)
-        if len(columns) > 1:
-            axes.legend(fontsize=8)
-    for axes in figure.axes[2:]:
-        axes.set_xlabel("frames (vehicle-steps)")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    return figure
 
 
 def _look(name: str, index: int = 0) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Make the table of a measured field: does the destination lie where a vehicle on a recorded track states it?
 
-    python recipes/tables/measured.py LOG.csv --out docs/results
+    python docs/tables/measured.py LOG.csv --out docs/results
 
 The log is one of recipes/replay_log.py with positions and their `altitude_km`; docs/results.md says which one the
 published table has. Each piece of the track is a flight from its first row to its last. The vehicle reads D, I, B_H of

@@ -1,7 +1,7 @@
 """Draw the figures of the documentation.
 
-    python recipes/tables/figures.py section-4 learning    # from runs of evaluations and trainings
-    python recipes/tables/figures.py conditions --out runs # from new flights; five minutes
+    python docs/tables/figures.py section-4 learning    # from runs of evaluations and trainings
+    python docs/tables/figures.py conditions --out runs # from new flights; five minutes
 
 From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
 alone), reliability (of stated probabilities). From runs: section-4 (field contours 4-1,
@@ -20,7 +20,6 @@ from typing import Any
 from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import Flight, evaluation_rollout
-from magrl.evaluation import figures as plots
 from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import label
 from magrl.field import IGRF, elements_gradient_at
@@ -39,6 +38,7 @@ from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
+import plots
 from flights import Flights, matching, place_errors, reliability, write_picture
 from grid import RUNS, declared
 
