@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib import import_module
 from typing import Any
@@ -26,11 +26,10 @@ _CHECKED = 5  # observations on which a network is checked
 
 
 class OnnxNetwork(nn.Module):
-    """A network of an ONNX file as an actor: from ``observation`` ``(..., K)`` to ``action`` in [-1, 1].
+    """A network of an ONNX file as an actor: from ``observation`` ``(N, K)`` to ``action`` in [-1, 1].
 
     The file has the input ``observation`` ``(N, K)`` and the output ``action`` ``(N, 2)``, or ``(N, 3)`` for a policy
-    that declares its arrival; beyond [-1, 1] it is cut off. A network with a memory has more inputs, of any names and
-    shapes ``(N, ...)``, and for each input ``NAME`` an output ``next_NAME``. They are 0 where an episode starts.
+    that declares its arrival; beyond [-1, 1] it is cut off.
 
     Args:
         content: content of the file.
@@ -46,33 +45,23 @@ class OnnxNetwork(nn.Module):
         self.content, self.size = content, size
         self.register_buffer("file", torch.frombuffer(bytearray(content), dtype=torch.uint8))
         session = _session(content)
-        inputs = {each.name: each for each in session.get_inputs()}
-        outputs = [each.name for each in session.get_outputs()]
-        memory = [name for name in inputs if name != "observation"]
-        self.after = tuple(f"next_{name}" for name in memory)
-        if "observation" not in inputs or set(outputs) != {"action", *self.after}:
+        inputs, outputs = session.get_inputs(), [each.name for each in session.get_outputs()]
+        if [each.name for each in inputs] != ["observation"] or outputs != ["action"]:
             raise ValueError(
-                "it must take 'observation' and the memory, and return 'action' and 'next_NAME' for each NAME of the "
-                f"memory (input_names, output_names of torch.onnx.export), got {[*inputs]} and {outputs}"
+                "it must take 'observation' and return 'action' (input_names, output_names of torch.onnx.export), got "
+                f"{[each.name for each in inputs]} and {outputs}"
             )
-        for name, each in inputs.items():
-            _check_input(each, [size] if name == "observation" else each.shape[1:])
-        self.shapes = {name: tuple(inputs[name].shape[1:]) for name in memory}
-        action, *after = self.run(torch.zeros(_CHECKED, size), {key: torch.zeros(1) for key in self.shapes})
+        _check_input(inputs[0], size)
+        action = self(torch.zeros(_CHECKED, size))
         if action.shape not in [(_CHECKED, 2), (_CHECKED, 3)] or not action.isfinite().all():
             raise ValueError(f"'action' must be finite, (N, 2) or (N, 3), got {short(action.tolist())}")
-        if (found := [tuple(part.shape[1:]) for part in after]) != [*self.shapes.values()]:
-            raise ValueError(f"the memory must keep its shapes {[*self.shapes.values()]}, the outputs have {found}")
         self.action_size = action.shape[-1]
 
-    def run(self, observation: Tensor, memory: Mapping[str, Tensor]) -> list[Tensor]:
-        """Return the action in [-1, 1] and the next memory for observations ``(N, K)``."""
-        values = {key: memory[key].expand(len(observation), *shape) for key, shape in self.shapes.items()}
-        values["observation"] = observation
-        feed = {key: value.detach().cpu().float().numpy() for key, value in values.items()}
-        found = _session(self.content).run(["action", *self.after], feed)
-        action, *after = (torch.from_numpy(part).to(observation.device) for part in found)
-        return [action.clamp(-1, 1), *after]
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the action in [-1, 1] for observations ``(N, K)``."""
+        feed = {"observation": observation.detach().cpu().float().numpy()}
+        (action,) = _session(self.content).run(["action"], feed)
+        return torch.from_numpy(action).to(observation.device).clamp(-1, 1)
 
 
 def with_description(content: bytes, description: Mapping[str, Any]) -> bytes:
@@ -114,15 +103,13 @@ def has_view(content: bytes) -> bool:
     return '"kind"' in _session(content).get_modelmeta().custom_metadata_map.get(DESCRIPTION, "")
 
 
-def exported(actor: nn.Module, size: int, memory: Mapping[str, Sequence[int]]) -> OnnxNetwork:
+def exported(actor: nn.Module, size: int) -> OnnxNetwork:
     """Return a network as ONNX, compared with the original on random observations; the original stays as it is.
 
     Args:
-        actor: module from ``observation`` ``(N, size)`` and the tensors of its memory to the action, or a tuple of the
-            action and the next memory; or a TensorDict module that reads these as keys and writes ``action`` and
-            ``("next", key)``, whose deterministic sample is taken.
+        actor: module from ``observation`` ``(N, size)`` to the action; or a TensorDict module with these keys, whose
+            deterministic sample is taken.
         size: numbers of an observation.
-        memory: shapes of the memory without its batch, by name.
 
     Raises:
         ImportError: without the extra ``onnx``.
@@ -130,13 +117,13 @@ def exported(actor: nn.Module, size: int, memory: Mapping[str, Sequence[int]]) -
     """
     _library("onnxscript")
     draw = torch.Generator().manual_seed(0)
-    inputs = [2 * torch.rand(_CHECKED, *shape, generator=draw) - 1 for shape in ((size,), *memory.values())]
+    observation = 2 * torch.rand(_CHECKED, size, generator=draw) - 1
     modes, validated = {part: part.training for part in actor.modules()}, Distribution._validate_args
     Distribution.set_default_validate_args(False)  # validation reads values, which a trace has not
     try:
         with torch.no_grad(), set_interaction_type("deterministic"), warnings.catch_warnings(action="ignore"):
-            step = _Step(actor, memory).eval()
-            wanted, content = step(*inputs), _written(step, inputs, memory)
+            step = _Step(actor).eval()
+            wanted, content = step(observation), _written(step, observation)
     except Exception as error:  # whatever the module and PyTorch raise
         reason = str(error.__cause__ or error).strip().partition("\n")[0]
         raise ValueError(f"PyTorch cannot export it: {reason or type(error).__name__}") from error
@@ -145,39 +132,35 @@ def exported(actor: nn.Module, size: int, memory: Mapping[str, Sequence[int]]) -
         for part, mode in modes.items():
             part.training = mode
     network = OnnxNetwork(content, size)
-    _compare(network, inputs, [wanted[0].clamp(-1, 1), *wanted[1:]])
+    _compare(network, observation, wanted.clamp(-1, 1))
     return network
 
 
 class _Step(nn.Module):
     """One step of an actor over plain tensors."""
 
-    def __init__(self, actor: nn.Module, memory: Mapping[str, Sequence[int]]) -> None:
+    def __init__(self, actor: nn.Module) -> None:
         super().__init__()
-        self.actor, self.keys = actor, ("observation", *memory)
+        self.actor = actor
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, observation: Tensor) -> Tensor:
         if not isinstance(self.actor, TensorDictModuleBase):
-            found = self.actor(*inputs)
-            return (found,) if isinstance(found, Tensor) else tuple(found)
-        acted = self.actor(TensorDict(dict(zip(self.keys, inputs, strict=True)), inputs[0].shape[:1]))
-        return acted["action"], *(acted["next", key] for key in self.keys[1:])
+            return self.actor(observation)
+        return self.actor(TensorDict({"observation": observation}, observation.shape[:1]))["action"]
 
 
-def _written(step: _Step, inputs: Sequence[Tensor], memory: Mapping[str, Sequence[int]]) -> bytes:
+def _written(step: _Step, observation: Tensor) -> bytes:
     """Return a step as ONNX, for a batch of any size."""
-    names = {"input_names": ["observation", *memory], "output_names": ["action", *(f"next_{key}" for key in memory)]}
-    options: dict[str, Any] = {"dynamic_shapes": {"inputs": tuple({0: torch.export.Dim("N")} for _ in inputs)}, **names}
-    program: Any = torch.onnx.export(step, tuple(inputs), dynamo=True, verbose=False, **options)
+    options: dict[str, Any] = {"input_names": ["observation"], "output_names": ["action"]}
+    options["dynamic_shapes"] = {"observation": {0: torch.export.Dim("N")}}
+    program: Any = torch.onnx.export(step, (observation,), dynamo=True, verbose=False, **options)
     return program.model_proto.SerializeToString()
 
 
-def _compare(network: OnnxNetwork, inputs: Sequence[Tensor], wanted: Sequence[Tensor]) -> None:
+def _compare(network: OnnxNetwork, observation: Tensor, wanted: Tensor) -> None:
     """Raise unless a network acts like another one, on one observation at a time."""
     for row in range(_CHECKED):
-        observation, *memory = (part[row : row + 1] for part in inputs)
-        found = network.run(observation, dict(zip(network.shapes, memory, strict=True)))
-        difference = max(float((a - b[row]).abs().max()) for a, b in zip(found, wanted, strict=True))
+        difference = float((network(observation[row : row + 1]) - wanted[row]).abs().max())
         if not difference <= TOLERANCE:
             raise ValueError(
                 f"its export acts differently, by {difference:g}: each row of the outputs must depend on the same row "
@@ -185,13 +168,12 @@ def _compare(network: OnnxNetwork, inputs: Sequence[Tensor], wanted: Sequence[Te
             )
 
 
-def _check_input(found: Any, shape: Sequence[int]) -> None:
-    """Raise unless an input has a shape after its batch, which must be of any size, and a type of real numbers."""
+def _check_input(found: Any, size: int) -> None:
+    """Raise unless an input is ``(N, size)`` for any N, of real numbers."""
     batch, *rest = found.shape or [None]
-    sized = all(isinstance(part, int) for part in rest)
-    if not isinstance(batch, str) or not sized or list(shape) != rest or found.type != "tensor(float)":
+    if not isinstance(batch, str) or rest != [size] or found.type != "tensor(float)":
         raise ValueError(
-            f"{found.name!r} must be float32 (N, {', '.join(map(str, shape))}) for any N (dynamic_axes or "
+            f"{found.name!r} must be float32 (N, {size}) for any N (dynamic_axes or "
             f"dynamic_shapes of torch.onnx.export), got {found.type} {found.shape}"
         )
 

@@ -7,7 +7,7 @@ transforms and is used like every other navigator.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -133,19 +133,11 @@ class FieldPolicy(Navigator):
             raise ValueError("the policy observes no-go areas, the environment has none: fly it in no_go_env")
         return super().forward(tensordict)
 
-    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        """Return the memory of a network at the start of an episode: zeros."""
-        shapes = getattr(self.actor, "shapes", {}).items()
-        return {name: torch.zeros(len(seen), *shape, device=seen.device) for name, shape in shapes}
-
-    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:  # noqa: ARG002
         """Return distance [km] and turn [rad], and the declaration if the network has one."""
         observed = self.observe(seen.select(*self.view.in_keys))
-        if isinstance(self.actor, OnnxNetwork):
-            action, *after = self.actor.run(observed["observation"], memory)
-            memory.update(dict(zip(self.actor.shapes, after, strict=True)))
-        else:
-            action = self.actor(observed)["action"]
+        network = isinstance(self.actor, OnnxNetwork)
+        action = self.actor(observed["observation"]) if network else self.actor(observed)["action"]
         return self.act.denormalize("action", action)
 
     def check_fits(self, env: EnvBase) -> None:
@@ -173,9 +165,7 @@ class FieldPolicy(Navigator):
             )
 
 
-def export_policy(
-    actor: nn.Module | Path | str, view: View, memory: Mapping[str, Sequence[int]] | None = None
-) -> FieldPolicy:
+def export_policy(actor: nn.Module | Path | str, view: View) -> FieldPolicy:
     """Return a network of any algorithm or library as a policy, run by onnxruntime (extra ``onnx``).
 
     Args:
@@ -184,7 +174,6 @@ def export_policy(
             (:func:`magrl.agents.onnx_policy.exported`), or the path of an ONNX file
             (:class:`magrl.agents.onnx_policy.OnnxNetwork`).
         view: what it observes, and its scaling and limits.
-        memory: shapes of the memory of a recurrent module without the batch, by name, such as ``{"hidden": (128,)}``.
 
     Raises:
         ImportError: without the extra ``onnx``.
@@ -200,19 +189,14 @@ def export_policy(
     check_type((nn.Module, Path, str), actor=actor)
     check_type(tuple(VIEWS.values()), view=view)
     if isinstance(actor, nn.Module):
-        network = exported(actor, view.size, memory or {})
+        network = exported(actor, view.size)
     else:
         with _reading(actor):
             network = OnnxNetwork(Path(actor).read_bytes(), view.size)
     return FieldPolicy(PolicyConfig(view, None), network)
 
 
-def save_policy(
-    path: Path | str,
-    policy: nn.Module | Path | str,
-    view: View | None = None,
-    memory: Mapping[str, Sequence[int]] | None = None,
-) -> None:
+def save_policy(path: Path | str, policy: nn.Module | Path | str, view: View | None = None) -> None:
     """Write a policy as numbers, text and tensors, for :func:`load_policy`.
 
     Args:
@@ -220,7 +204,6 @@ def save_policy(
         policy: :class:`FieldPolicy`, :class:`~magrl.Anywhere`, :class:`~magrl.navigators.Memory`, or a network, as
             :func:`export_policy` takes it.
         view: what such a network observes.
-        memory: its memory.
 
     Raises:
         TypeError: for a network without what it observes.
@@ -245,7 +228,7 @@ def save_policy(
     if not isinstance(policy, FieldPolicy):
         if view is None:
             raise TypeError(f"{policy!r:.80} is saved with what it observes: save_policy('policy.onnx', network, view)")
-        policy = export_policy(policy, view, memory)
+        policy = export_policy(policy, view)
     network, config = isinstance(policy.actor, OnnxNetwork), asdict(policy.config)
     if network != (Path(path).suffix == ".onnx"):
         kind = "an exported network ends with .onnx, another policy does not"

@@ -45,7 +45,7 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
             - a TensorDict module that reads ``observation`` and writes ``action`` in [-1, 1], also with recurrent
               modules of TorchRL, or another module of PyTorch from the one to the other;
             - any other TensorDict module, such as a navigator: it reads raw keys, and writes ``action`` in km and rad;
-            - a model of stable-baselines3 or sb3-contrib, or what else has their ``predict``;
+            - a model of stable-baselines3, or what else has their ``predict``;
             - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
               ``act(observations, state)`` returns actions and the next state, which is None at the start. It gets no
               other key.
@@ -134,10 +134,8 @@ def _of_text(text: str) -> TensorDictModuleBase | str:
         return text
 
     def act(seen: NDArray[np.float32], state: Any, _: object) -> tuple[Any, Any]:
-        network, memory = state or (OnnxNetwork(content, seen.shape[-1]), None)
-        memory = dict.fromkeys(network.shapes, torch.zeros(1)) if memory is None else memory
-        actions, *after = network.run(torch.from_numpy(seen), memory)
-        return actions, (network, dict(zip(network.shapes, after, strict=True)))
+        network = state or OnnxNetwork(content, seen.shape[-1])
+        return network(torch.from_numpy(seen)), network
 
     return _Arrays(act)
 

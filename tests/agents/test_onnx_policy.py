@@ -14,8 +14,7 @@ import torch
 from onnx import ModelProto, TensorProto
 from support.networks import network_file
 from support.paths import ROOT, with_paths
-from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictModuleBase
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -65,49 +64,6 @@ def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) 
     torch.testing.assert_close(found["next", "position"], wanted["next", "position"], rtol=1e-5, atol=1e-4)
 
 
-class Recurrent(nn.Module):
-    """A network with a memory, which reads plain readings and counts its steps."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer, self.head = nn.Linear(9 + 16, 16), nn.Linear(16, 2)
-
-    def forward(self, observation: Tensor, hidden: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        after = self.layer(torch.cat((observation / 1e4, hidden.flatten(1)), -1)).tanh()
-        return (self.head(after) + count / 10).tanh(), after.unflatten(-1, (2, 8)), count + 1
-
-
-class Twice(TensorDictModuleBase):
-    """A policy that is called twice in each step."""
-
-    def __init__(self, policy: FieldPolicy) -> None:
-        super().__init__()
-        self.policy, self.in_keys, self.out_keys = policy, policy.in_keys, policy.out_keys
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self.policy(self.policy(tensordict))
-
-
-def test_a_recurrent_network_keeps_its_memory_for_each_vehicle(tmp_path: Path) -> None:
-    """From the start of its episode on, where others start at other steps; a second call changes nothing."""
-    torch.manual_seed(0)
-    network, env = Recurrent(), plain_env(arrival="distance", radius_km=300.0)
-    save_policy(tmp_path / "own.onnx", network, READINGS, memory={"hidden": (2, 8), "count": (1,)})
-    policy = load_policy(tmp_path / "own.onnx")
-    flown = env.rollout(12, Twice(policy), break_when_any_done=False)
-    assert len(set(flown["next", "done"].squeeze(-1).int().argmax(1).tolist())) > 1
-    observation = torch.cat([flown[key] for key in READINGS.keys], -1)
-    for vehicle in range(5):
-        memory = torch.zeros(1, 2, 8), torch.zeros(1, 1)
-        for step in range(12):
-            if flown["elapsed_steps"][vehicle, step] == 0:
-                memory = tuple(map(torch.zeros_like, memory))
-            with torch.no_grad():
-                action, *memory = network(observation[vehicle, step][None], *memory)
-            expected = READINGS.action_transform().denormalize("action", action)[0]
-            torch.testing.assert_close(flown["action"][vehicle, step], expected, rtol=1e-4, atol=1e-4)
-
-
 def squashed(x: Tensor) -> Tensor:
     return x[..., :2].sigmoid()
 
@@ -137,8 +93,8 @@ def test_what_cannot_be_exported_is_refused_with_its_reason() -> None:
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """The file of a network with a memory, from another library."""
-    save_policy(tmp_path / "own.onnx", network_file(tmp_path, READINGS.size, memory=True), READINGS)
+    """The file of a network of another library."""
+    save_policy(tmp_path / "own.onnx", network_file(tmp_path, READINGS.size), READINGS)
     return tmp_path / "own.onnx"
 
 
@@ -211,12 +167,12 @@ def doubled(model: ModelProto) -> None:
 
 
 def test_damaged_files_are_refused(own: Path, tmp_path: Path) -> None:
-    """Also without one of the four nodes of the graph."""
+    """Also without one of the nodes of the graph."""
     for change, message in (
-        (renamed, "it must take 'observation' and the memory, and return 'action' and 'next_NAME'"),
+        (renamed, "it must take 'observation' and return 'action'"),
         (of_one_row, r"'observation' must be float32 \(N, 9\) for any N \(dynamic_axes"),
         (doubled, ""),
-        *((lambda model, number=number: model.graph.node.pop(number), "") for number in range(4)),
+        *((lambda model, number=number: model.graph.node.pop(number), "") for number in range(3)),
         (described(lambda _: {}), ""),
         (described(lambda content: content | {"format": 7}), ""),
         (described(lambda content: content | {"kind": "map"}), ""),

@@ -67,7 +67,7 @@ def policy(kind: str, folder: Path) -> TensorDictModuleBase:
         return FieldPolicy(PolicyConfig(env.observation_view(), (8,)))
     if kind == "exported":
         view = ReadingView(max_move_km=50.0, max_turn_rad=1.5)
-        return export_policy(network_file(folder, view.size, memory=True), view)
+        return export_policy(network_file(folder, view.size), view)
     if kind == "declaring":
         return Declaring(Secant(), arrival="declared")
     return make_navigator(kind, env)

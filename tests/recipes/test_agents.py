@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 from pandas import DataFrame
 from support.recipes import load
 
@@ -14,20 +12,16 @@ from magrl import score
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.sb3 import BatchedVecEnv
 
-contrib = pytest.importorskip("sb3_contrib")
-agents = load("tables/agents")
+sb3 = pytest.importorskip("stable_baselines3")
+agents = load("docs/tables/agents")
 
 
-def test_an_agent_with_a_memory_acts_as_its_model() -> None:
+def test_a_saved_agent_has_the_score_of_its_model(tmp_path: Path) -> None:
     envs = BatchedVecEnv(GeomagneticNavVectorEnv(4, task="nogo", autoreset_mode="SameStep"))
-    shape = {"net_arch": [8], "lstm_hidden_size": 8, "log_std_init": 0}
-    model = contrib.RecurrentPPO("MlpLstmPolicy", envs, policy_kwargs=shape, seed=0, device="cpu")
-    observation, memory, state = envs.reset(), (torch.zeros(4, 8), torch.zeros(4, 8)), None
-    for first in (np.ones(4), np.zeros(4)):
-        with torch.no_grad():
-            action, *memory = agents.Acting(model.policy)(torch.from_numpy(observation), *memory)
-        wanted, state = model.predict(observation, state, first, deterministic=True)
-        assert action.clamp(-1, 1).numpy() == pytest.approx(wanted, abs=1e-6)
+    model = sb3.PPO("MlpPolicy", envs, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu")
+    agents.save_agent(tmp_path / "agent.onnx", model.policy, "nogo")
+    saved, own = (score(agent, "nogo", episodes=4, max_steps=5) for agent in (tmp_path / "agent.onnx", model))
+    assert saved["return"] == pytest.approx(own["return"], abs=1e-4)
 
 
 def test_the_agent_of_the_median_is_kept(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 from pandas import read_csv
-from support.recipes import RECIPES, load
+from support.recipes import ROOT, TABLES, load
 from tensordict import TensorDict
 
 from magrl import score
@@ -22,16 +22,13 @@ from magrl.files import locked
 from magrl.navigators import Secant
 from magrl.training import UsageError
 
-pytest.importorskip("sb3_contrib")
-sys.path.insert(0, str(RECIPES / "tables"))
-sweep = load("tables/sweep")
+pytest.importorskip("stable_baselines3")
+sweep = load("docs/tables/sweep")
 bars = sys.modules["bars"]
-RESULTS = RECIPES.parent / "docs" / "results"
+RESULTS = ROOT / "docs" / "results"
 
 
-@pytest.mark.parametrize(
-    ("task", "name"), [("nogo", "PPO"), pytest.param("readings", "RecurrentPPO", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("task", "name"), [("nogo", "PPO")])
 def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monkeypatch, task: str, name: str) -> None:
     monkeypatch.setattr(sweep, "VEHICLES", 4)
     monkeypatch.setattr(sweep, "POINTS", 2)
@@ -74,7 +71,9 @@ def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
 
 
 def test_a_recipe_that_fails_says_why(tmp_path: Path, monkeypatch) -> None:
-    assert all((RECIPES / script).is_file() for tasks in sweep.RECIPES.values() for script, *_ in tasks.values())
+    assert all(
+        (ROOT / "recipes" / script).is_file() for tasks in sweep.RECIPES.values() for script, *_ in tasks.values()
+    )
     (tmp_path / "fails.py").write_text("raise SystemExit('no power')", encoding="utf-8")
     monkeypatch.setitem(sweep.RECIPES, "GG-TD3", {"box": (str(tmp_path / "fails.py"),)})
     with pytest.raises(UsageError, match=r"fails\.py ended with status 1: no power"):
@@ -104,7 +103,7 @@ def test_no_process_is_left_after_a_kill() -> None:
 def test_help_is_printed(name: str, monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit, match="0"):
-        runpy.run_path(str(RECIPES / "tables" / f"{name}.py"), run_name="__main__")
+        runpy.run_path(str(TABLES / f"{name}.py"), run_name="__main__")
     assert "usage" in capsys.readouterr().out
 
 
@@ -113,7 +112,7 @@ def test_jobs_of_one_seed_come_first() -> None:
     assert [seed for *_, seed in jobs] == sorted(seed for *_, seed in jobs)
     names = {"PPO", "SAC", "TD3", "GG-TD3"}
     assert {(task, name) for task, name, seed in jobs if seed == 4} == {("box", name) for name in names} | {
-        ("storm", name) for name in ("PPO", "RecurrentPPO", "ppo_memory")
+        ("storm", name) for name in ("PPO", "ppo_memory")
     }
 
 

@@ -1,0 +1,271 @@
+"""Learning curves on the named tasks: algorithms of stable-baselines3, and the recipes of this library.
+
+    pip install -c constraints.txt -e '.[bench]'
+    python docs/tables/sweep.py                                     # everything: about six hours on two cores
+    python docs/tables/sweep.py --tasks box --algorithms PPO --seeds 0
+    python docs/tables/sweep.py --no-train                          # table and figure of the runs that exist
+
+A run that has ended is not repeated, so that the same command resumes a sweep; a folder has one sweep at a time. Scores
+are those of :func:`magrl.score`. The settings of an algorithm are the same for all tasks. The agent of the run with the
+median SPL is kept in docs/results/agents, for agents.py.
+"""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import itertools
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from agents import keep_agents, save_agent
+from bars import BARS, VEHICLES, bar, bars_of, draw_areas
+from flights import write_picture
+from magrl import score
+from magrl.envs.gymnasium import GeomagneticNavVectorEnv
+from magrl.envs.navigation import NAMED_ENVS
+from magrl.envs.sb3 import BatchedVecEnv
+from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
+from magrl.evaluation.tables import markdown_table
+from magrl.files import check_writable, locked, read_text, write_text, write_with
+from magrl.training import UsageError, command
+
+import numpy as np
+import torch
+import tyro
+from matplotlib.figure import Figure
+from pandas import DataFrame, concat, read_csv
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from tqdm import tqdm
+
+POINTS = 10
+"""Points of a learning curve."""
+SCORES = ("SR", "SPL", "return")
+"""Columns of scores."""
+Row = dict[str, Any]
+
+
+class Algorithm(NamedTuple):
+    """An algorithm: how to make it, vehicles, steps on each task [thousands], and its settings."""
+
+    make: Callable[..., Any]
+    num_envs: int
+    thousands: dict[str, int]
+    settings: dict[str, Any]
+
+
+ON_POLICY = {"n_steps": 32, "batch_size": 2048, "n_epochs": 5, "learning_rate": 1e-3}
+OFF_POLICY = {"learning_rate": 1e-3, "learning_starts": 1024, "train_freq": 1, "gradient_steps": 8, "batch_size": 256}
+OFF_POLICY |= {"gamma": 0.9, "tau": 0.01, "buffer_size": 200_000, "policy_kwargs": {"net_arch": [128, 128, 128]}}
+EXPLORED = {"action_noise": NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))}
+WIDE = {"policy_kwargs": {"net_arch": [64, 64], "log_std_init": -0.5}}
+ALGORITHMS = {
+    "PPO": Algorithm(
+        partial(PPO, "MlpPolicy"),
+        256,
+        {"box": 1000, "nogo": 1000, "anywhere": 200, "readings": 500, "storm": 500},
+        ON_POLICY | WIDE,
+    ),
+    "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, {"box": 50, "nogo": 50}, OFF_POLICY),
+    "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, {"box": 50, "nogo": 50}, OFF_POLICY | EXPLORED),
+}
+RECIPES: dict[str, dict[str, tuple[str, ...]]] = {
+    "GG-TD3": {"box": ("td3_gradient_guided.py",)},
+    "TD3-magrl": {"nogo": ("td3_gradient_guided.py", "--task", "nogo")},
+    "ppo_anywhere": {"anywhere": ("ppo_anywhere.py", "--preset", "fast")},
+    "ppo_memory": {task: ("ppo_memory.py", "--task", task) for task in ("readings", "storm")},
+}
+"""Recipes: file and options by task."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to train, and where."""
+
+    tasks: tuple[str, ...] = tuple(NAMED_ENVS)
+    """Named tasks."""
+    algorithms: tuple[str, ...] = (*ALGORITHMS, *RECIPES)
+    """Algorithms; each is trained on its own tasks among these."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of weights, exploration and training tasks."""
+    jobs: int = 2
+    """Runs at a time, with one thread each."""
+    train: bool = True
+    """Whether to train what is missing."""
+    out: Path = Path("runs/sweep")
+    """Folder of the runs."""
+    results: Path = Path("docs/results")
+    """Folder of table, data and figure."""
+
+
+def scores_of(agent: Any, task: str) -> Row:
+    """Return the scores of an agent that a curve shows."""
+    scores = score(agent, task, episodes=VEHICLES)
+    return {key: scores[key] for key in SCORES}
+
+
+class Curve(BaseCallback):
+    """Score the policy at :data:`POINTS` numbers of steps, off the clock."""
+
+    def __init__(self, task: str, steps: int) -> None:
+        super().__init__()
+        self.task, self.steps, self.rows, self.began = task, steps, list[Row](), time.process_time()
+
+    def point(self) -> None:
+        """Add a point."""
+        paused = time.process_time()
+        row = {"steps": self.num_timesteps, "cpu_s": paused - self.began}
+        self.rows.append(row | scores_of(self.model, self.task))
+        self.began += time.process_time() - paused
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= len(self.rows) * self.steps / POINTS:
+            self.point()
+        return True
+
+
+def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
+    """Train an algorithm of another library, and write its agent; return its learning curve."""
+    chosen = ALGORITHMS[name]
+    envs = GeomagneticNavVectorEnv(chosen.num_envs, task=task, autoreset_mode="SameStep")
+    model = chosen.make(BatchedVecEnv(envs), seed=seed, device="cpu", **deepcopy(chosen.settings))
+    curve = Curve(task, 1000 * chosen.thousands[task])
+    model.learn(curve.steps, callback=curve)
+    curve.point()  # after the last update
+    save_agent(agent, model.policy, task)
+    return curve.rows
+
+
+def die_with_parent() -> None:
+    """End this process when its parent ends, also by a kill (Linux), and quietly by Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
+def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
+    """Train by a recipe; return its learning curve on the validation tasks, and its score as the last point.
+
+    Raises:
+        UsageError: with the last line that the recipe wrote, where it failed.
+    """
+    script, *options = RECIPES[name][task]
+    began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
+    line = [sys.executable, Path(__file__).parents[2] / "recipes" / script, *options]
+    done = subprocess.run(line, capture_output=True, encoding="utf-8", preexec_fn=die_with_parent, check=False)
+    if done.returncode:
+        raise UsageError(f"{script} ended with status {done.returncode}: {done.stderr.strip().rpartition(chr(10))[2]}")
+    points = [row for row in csv.DictReader(read_text(folder / "train.csv").splitlines()) if row["eval_spl"]]
+    names = {"steps": "frames", "SR": "eval_success_rate", "SPL": "eval_spl"}
+    rows = [{key: float(point[column]) for key, column in names.items()} for point in points]
+    final = scores_of(next(folder.glob("policy.*")), task)
+    cpu_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - began
+    return [*rows, rows[-1] | {"cpu_s": cpu_s} | final]
+
+
+def run(config: Config, task: str, name: str, seed: int) -> Path:
+    """Train one run, unless its file exists; return the file."""
+    path = config.out / f"{task}-{name}-seed{seed}.csv"
+    if not path.exists():
+        shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
+        folder, agent = path.with_suffix(""), path.with_suffix(".onnx")
+        rows = recipe(task, name, seed, folder) if name in RECIPES else trained(task, name, seed, agent)
+        about = {"task": task, "algorithm": name, "seed": seed}
+        write_with(path, DataFrame([about | row for row in rows]).round(2).to_csv, index=False)
+    return path
+
+
+def planned(config: Config) -> Iterator[tuple[str, str, int]]:
+    """Yield task, algorithm and seed of all runs, in the order of their seeds."""
+    for seed, name in itertools.product(config.seeds, config.algorithms):
+        tasks = RECIPES.get(name) or ALGORITHMS[name].thousands
+        yield from ((task, name, seed) for task in tasks if task in config.tasks)
+
+
+def ends(curves: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:
+    """Yield task and algorithm, and the last points of their runs."""
+    last = curves.groupby(["task", "algorithm", "seed"], sort=False).last().reset_index()
+    yield from last.groupby(["task", "algorithm"], sort=False)
+
+
+def table(curves: DataFrame) -> str:
+    """Return the Markdown table of final scores and of the bars: interquartile means, with intervals over seeds."""
+    rows = []
+    for (task, name), runs in ends(curves):
+        low, high = stratified_bootstrap([torch.tensor(runs["SPL"].to_numpy())])
+        rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
+        about = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k", f"{runs['cpu_s'].median() / 60:.1f} min"
+        earned = f"{runs['return'].median():.1f}".replace("nan", "—")  # old runs have none
+        interval = f" ({low:.1f}–{high:.1f})" * (len(runs) > 1)
+        rows.append([task, name, *about, earned, f"{rate:.1f}", f"{spl:.1f}{interval}"])
+    for task in curves["task"].unique():
+        for name in bars_of(task):
+            scores = bar(task, name)
+            rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in ("return", "SR", "SPL"))])
+    rows.sort(key=lambda row: list(NAMED_ENVS).index(row[0]))
+    return markdown_table(["task", "agent", "seeds × steps", "CPU", "return", "SR %", "SPL %"], rows)
+
+
+def figure(curves: DataFrame) -> Figure:
+    """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
+    tasks = [task for task in NAMED_ENVS if task in set(curves["task"])]
+    drawn = Figure(figsize=(10, 7.5), layout="constrained")
+    for axes, task in zip(drawn.subplots(2, 3).flat, tasks, strict=False):
+        for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
+            points = runs.assign(point=runs.groupby("seed").cumcount()).groupby("point")
+            steps, spl = points["steps"].median(), points["SPL"]
+            color = f"C{[*ALGORITHMS, *RECIPES].index(name)}"
+            axes.plot(steps, spl.median(), color=color, label=name)
+            axes.fill_between(steps, spl.min(), spl.max(), color=color, alpha=0.2, lw=0)
+        for name, style in zip(bars_of(task)[:0:-1], ("-", "--", ":", "-.", (0, (1, 4))), strict=False):  # oracle first
+            axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
+        axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
+        axes.legend(fontsize="xx-small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
+    if len(tasks) < len(drawn.axes):
+        draw_areas(drawn.axes[len(tasks)])
+    for axes in drawn.axes[len(tasks) + 1 :]:
+        axes.remove()
+    return drawn
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Train what is missing, and write table, data and figure."""
+    config = tyro.cli(Config, description=__doc__, args=args)
+    for name in (*config.tasks, *config.algorithms):
+        if name not in (known := (*NAMED_ENVS, *ALGORITHMS, *RECIPES)):
+            raise UsageError(f"unknown task or algorithm {name!r}: choose from {', '.join(known)}")
+    config.out.mkdir(parents=True, exist_ok=True)
+    check_writable(config.results / "scores.csv")
+    jobs = list(planned(config))
+    if config.train:
+        os.environ["OMP_NUM_THREADS"] = "1"
+        with locked(config.out), ProcessPoolExecutor(config.jobs, get_context("spawn"), die_with_parent) as pool:
+            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
+                done.result()
+    paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
+    if not paths:
+        raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
+    curves = concat([read_csv(path) for path in paths])
+    write_with(config.results / "scores.csv", curves.to_csv, index=False)
+    write_text(config.results / "scores.md", table(curves))
+    keep_agents(ends(curves), config.out, config.results / "agents")
+    write_picture(config.results / "scores.png", figure(curves), config.results / "scores.csv", dpi=130)
+
+
+if __name__ == "__main__":
+    command("sweep.py", main)
