@@ -360,7 +360,8 @@ def read_table(text: str, **options: Any) -> DataFrame:
         with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
             table = pandas.read_csv(io.StringIO(text), **shape, **options)
     except (pandas.errors.ParserError, pandas.errors.ParserWarning) as error:
-        reason = "a row has more cells than the header, or a quoted text is not closed"
+        reason = f"a row has more cells than the columns {short(names, 300)}, as with decimal commas"
+        reason += ", or a quoted text is not closed"
         raise ValueError(f"{reason}: {str(error).strip()}") from error
     return table.rename(columns=str.strip)
 

@@ -75,7 +75,7 @@ class Config:
     model: str = "IGRF-14"
     """Model of the Earth that it then carries."""
     time: str = "time"
-    """Column of the time, numbers or ISO 8601; optional."""
+    """Column of the time, seconds or ISO 8601; optional."""
     declination: str = "D"
     """Column of the declination [deg]."""
     inclination: str = "I"
@@ -85,7 +85,9 @@ class Config:
     heading: str = "heading"
     """Column of the heading of the leg from the previous row [deg]."""
     distance: str = "distance"
-    """Column of the length of the leg from the previous row [km]."""
+    """Column of the length of the leg from the previous row [km]; without it, the speed counts."""
+    speed: str = "speed"
+    """Column of the mean speed since the previous row [m/s]."""
     latitude: str = "latitude"
     """Column of the true latitude [deg]; optional, together with the longitude."""
     longitude: str = "longitude"
@@ -98,7 +100,7 @@ class Config:
 
 def read_log(config: Config) -> pd.DataFrame:
     """Return the columns of the log, see :func:`magrl.vehicle.logs.read_readings`."""
-    keys = (*ELEMENTS, "heading", "distance", *PLACE, "altitude")
+    keys = (*ELEMENTS, "heading", "distance", "speed", *PLACE, "altitude")
     names = {key: getattr(config, OPTIONS.get(key, key)) for key in keys}
     log = read_readings(config.log, names, config.time)
     log.attrs["date"] = config.date or log.attrs["date"]

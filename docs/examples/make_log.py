@@ -22,7 +22,7 @@ NOISE = (0.02, 0.02, 2.0)
 
 
 def write(path: Path) -> None:
-    """Write time [h], reading [deg, deg, nT], heading [deg], distance since the last row [km] and position [deg]."""
+    """Write time [s], reading [deg, deg, nT], heading [deg], distance since the last row [km] and position [deg]."""
     place = torch.tensor([62.0, 3.0], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -35,8 +35,8 @@ def write(path: Path) -> None:
             reading = reading + torch.randn(3, generator=generator, dtype=torch.float64) * torch.tensor(NOISE)
             d, i, h = reading.tolist()
             latitude, longitude = place.tolist()
-            time = row * LEG_KM / SPEED_KM_H
-            numbers = f"{time:.2f} {d:.3f} {i:.3f} {h:.1f} {heading:.1f} {distance:.1f} {latitude:.5f} {longitude:.5f}"
+            time = row * LEG_KM / SPEED_KM_H * 3600
+            numbers = f"{time:.0f} {d:.3f} {i:.3f} {h:.1f} {heading:.1f} {distance:.1f} {latitude:.5f} {longitude:.5f}"
             writer.writerow(numbers.split())
 
 

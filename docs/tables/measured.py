@@ -31,7 +31,7 @@ import tyro
 from torch import Tensor
 
 RECIPE = "measured.py"
-NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude", "altitude_km")
+NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude", "altitude")
 SLOW = (0.05, 0.03, 15.0)
 """Standard deviations of what varies along the path, crust and currents, on D, I [deg], B_H [nT]: 15 nT; chosen."""
 RANGE_KM = {(300.0, 500.0): 400.0, (1200.0, 1800.0): 1000.0}

@@ -30,17 +30,25 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "field": FIELD_NT | {symbol: FIELD_NT[unit] for symbol, unit in SYMBOLS.items()},
     "angle": {"deg": 1.0, "rad": 57.29577951308232, "degrees": 1.0, "radians": 57.29577951308232},
     "length": {"km": 1.0, "m": 1e-3, "nmi": 1.852, "ft": 3.048e-4},
+    "speed": {"m_s": 1.0, "km_h": 1 / 3.6, "kn": 1.852 / 3.6},
 }
-"""Suffixes of a column, in the first unit of each kind: nanotesla, degrees, kilometers."""
+"""Suffixes of a column, in the first unit of each kind: nanotesla, degrees, kilometers, meters per second."""
+_FORM = "columns are separated by commas, decimals have a point"
 _ANY, _ROUNDING = (-math.inf, math.inf), 1e-3
 COLUMNS: Mapping[str, tuple[str, float, float]] = {
     "B_H": ("field", *_ANY),
+    "heading": ("angle", -360, 360),
     "distance": ("length", 0, 40000),
+    "speed": ("speed", 0, 1000),
     "latitude": ("angle", -90, 90),
     "longitude": ("angle", -360, 360),
     "altitude": ("length", *IGRF.altitude_range_km),
 }
 """Columns that are no unlimited angle: kind of the unit, the least and the greatest value."""
+MAX_SPEED, ORBITAL_SPEED, SPACE_KM = 1000.0, 1e4, 100.0
+"""Speed that no vehicle exceeds, and no satellite, which is above an altitude [m/s, m/s, km]."""
+MAX_CURRENT = 3.0
+"""Speed that no ocean current exceeds [m/s]; winds are less than half of an airspeed."""
 _EPOCH = 1e8  # seconds: a time beyond is since 1970, one before since the log began
 
 MOST_SPIKES = 0.2
@@ -55,18 +63,19 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
 
     Args:
         path: the file.
-        names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
-            ``longitude``, and ``altitude``, which the file may lack. A unit that ends a name counts, such as of
-            ``H_uT``, and a name is also found with one, such as ``altitude_m``; without one, it is nT, deg or km.
-        time: its column of the time, numbers or ISO 8601, which it may lack.
+        names: its columns by ``D``, ``I``, ``B_H``, ``heading``, and ``distance``, or ``speed`` beside a time; and
+            optionally ``latitude`` and ``longitude``, and ``altitude``, which the file may lack. A unit that ends a
+            name counts, such as of ``H_uT``, and a name is also found with one, such as ``altitude_m``; without one, it
+            is nT, deg, km or m/s.
+        time: its column of the time, seconds or ISO 8601, which it may lack.
 
     Returns:
         Columns of these names, ``row``, the number of each in the file, and ``time``; without rows that repeat the time
         of the row before. ``attrs`` has the ``notes`` on the times, and their ``date``.
 
     Raises:
-        ValueError: for a file that cannot be read, a missing column, a value that is not a number, or times that run
-            backward.
+        ValueError: for a file that cannot be read, a missing column, a value that is not a number or not possible,
+            times that run backward, or legs whose :func:`speeds <check_speeds>` are not possible.
 
     Example:
         >>> read_readings("nowhere.csv", {})
@@ -87,6 +96,12 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
             left = int((~new).sum())
             notes = [f"{left} rows with the time of the row before left out"] if left else []
             log.attrs = {"notes": notes, "date": date_of(float(times[0]))}
+            step_s = np.diff(times[new], prepend=times[0])
+            if "distance" not in log:
+                log["distance"] = log["speed"] * step_s / 1000
+            check_speeds(log, step_s)
+        elif "distance" not in log:
+            raise ValueError(f"speeds need a column {time!r} of times, in seconds or ISO 8601")
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     return log
@@ -102,8 +117,12 @@ def _columns(raw: DataFrame, names: Mapping[str, str]) -> dict[str, Array]:
         if name in raw:
             columns[key] = (unit_of(name, kind) or 1.0) * numbers(raw[name].fillna(""))
             check_range(key, columns[key])
-        elif key in ("D", "I", "B_H", "heading", "distance") or (located and key != "altitude"):
-            raise ValueError(f"no column is {name!r}: name the column of {key}, one of {short([*raw], 300)}")
+        elif key in ("D", "I", "B_H", "heading") or (located and key in _PLACE[:2]):
+            raise ValueError(f"no column is {name!r}: name the column of {key}, one of {short([*raw], 300)}; {_FORM}")
+    if "distance" in names and not columns.keys() & {"distance", "speed"}:
+        raise ValueError(
+            f"no column is the distance or the speed of the legs: name one of {short([*raw], 300)}; {_FORM}"
+        )
     return columns
 
 
@@ -131,14 +150,62 @@ def check_range(name: str, values: Array) -> None:
     Example:
         >>> check_range("latitude", np.array([2.0, 200.0]))
         Traceback (most recent call last):
-        ValueError: latitude 200 is not from -90 to 90 deg: check it and its unit, as in latitude_rad
+        ValueError: row 2, latitude 200 is not from -90 to 90 deg: check it and its unit, as in latitude_rad
     """
     kind, low, high = COLUMNS.get(name, ("angle", *_ANY))
-    wrong = values[(values < low - _ROUNDING) | (values > high + _ROUNDING)]
-    if len(wrong):
+    wrong = (values < low - _ROUNDING) | (values > high + _ROUNDING)
+    if wrong.any():
         unit, other, *_ = UNITS[kind]
-        limits = f"{name} {wrong[0]:.10g} is not from {low:g} to {high:g} {unit}"
+        row = int(wrong.argmax())
+        limits = f"row {row + 1}, {name} {values[row]:.10g} is not from {low:g} to {high:g} {unit}"
         raise ValueError(f"{limits}: check it and its unit, as in {name}_{other}")
+
+
+def check_speeds(log: DataFrame, step_s: Array) -> None:
+    """Raise unless the speeds of all legs are possible: from positions, if there are any, and as stated.
+
+    Args:
+        log: columns ``row`` and ``distance``, and optionally ``latitude``, ``longitude`` and ``altitude``.
+        step_s: time since the row before [s], ``(N,)``.
+
+    Raises:
+        ValueError: with the first row whose speed exceeds :data:`MAX_SPEED`, or whose speed over ground differs from
+            the stated one by more than half of it and :data:`MAX_CURRENT`, and the likely cause.
+
+    Example:
+        >>> check_speeds(DataFrame({"row": [1, 2], "distance": [0.0, 20.0]}), np.array([0.0, 0.03]))
+        Traceback (most recent call last):
+        ValueError: row 2: a leg of 20 km in 0.03 s is 666667 m/s: times must be in seconds or ISO 8601, distances in km
+    """
+    stated = log["distance"].to_numpy(float)[1:] / step_s[1:] * 1000
+    speed = stated
+    if "latitude" in log:
+        place = _places(log)[:, :2]
+        speed = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))[0].numpy() / step_s[1:] * 1000
+    space = log.get("altitude", log["distance"] * 0).to_numpy(float)[1:] > SPACE_KM
+    apart = np.abs(speed - stated) > np.maximum(MAX_CURRENT, stated / 2)
+    wrong = (np.maximum(speed, stated) > np.where(space, ORBITAL_SPEED, MAX_SPEED)) | apart
+    if not wrong.any():
+        return
+    leg = int(wrong.argmax())
+    row, seconds, km = log["row"][leg + 1], step_s[leg + 1], log["distance"][leg + 1]
+    text = f"row {row}: a leg of {km:g} km in {seconds:g} s is {stated[leg]:.6g} m/s"
+    if apart[leg]:
+        text += f", the positions are {speed[leg] * seconds / 1000:.6g} km apart, which is {speed[leg]:.6g} m/s"
+    raise ValueError(f"{text}: {_cause(log, apart, leg)}")
+
+
+def _cause(log: DataFrame, apart: NDArray[np.bool_], leg: int) -> str:
+    """Return the likely cause of an impossible speed of a leg."""
+    if not apart[leg]:
+        return "times must be in seconds or ISO 8601, distances in km"
+    if (log.loc[leg : leg + 1, ["latitude", "longitude"]] == 0).all(axis=1).any():
+        return "a position of 0, 0 stands for none: remove the row, or leave both columns out"
+    if (log["distance"].diff()[2:] > 0).all() and apart.mean() > MOST_SPIKES:
+        return "the distances look like those since the start: they must be since the row before"
+    if apart.mean() <= MOST_SPIKES:
+        return "the clock jumps there, or the position is wrong"
+    return "check the units of times, speeds and distances, and the signs of the positions (east and north positive)"
 
 
 def times_of(column: Series) -> Array:
@@ -223,7 +290,7 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     (:data:`~magrl.vehicle.onboard.known.MODEL_STD`), and legs with the positions.
 
     Args:
-        readings: columns of :func:`~magrl.vehicle.logs.readings_of`. Where D is not measured (``D_std``), it converts
+        readings: columns of :func:`read_readings`. Where D is not measured (``D_std``), it converts
             the headings.
         date: date for IGRF; without it, legs alone are compared.
 
@@ -303,11 +370,16 @@ def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> l
         far = f"the positions are {ratio:.3g} times as far apart as the distances of the legs"
         texts.append(f"{far}: check the log and its unit")
     turn, east = torch.rad2deg(bearing[going]) - heading[going], declination[1:][going]
+    mirrored = torch.rad2deg(bearing[going]) + heading[going]
     course = torch.deg2rad(turn)
     drift = math.degrees(torch.atan2(course.sin().mean(), course.cos().mean()).item())
-    drifts, left = ((angle + 180).remainder(360).sub(180).square().mean().sqrt() for angle in (turn, turn - east))
+    drifts, left, mirror = (
+        (angle + 180).remainder(360).sub(180).square().mean().sqrt() for angle in (turn, turn - east, mirrored)
+    )
     text = f"the course between positions is {drift:.0f} deg to the right of the heading"
-    if abs(abs(drift) - 180) < LEAST_TURN_DEG:
+    if drifts > LEAST_TURN_DEG and mirror < drifts / 3:
+        texts.append("the courses between positions mirror the headings: longitudes are positive to the west")
+    elif abs(abs(drift) - 180) < LEAST_TURN_DEG:
         texts.append(f"{text}: the heading is reciprocal, or the vehicle goes astern")
     elif drifts > 3 and left < drifts / 3:
         north = f"as D is {east.median():.0f} deg: the heading is from magnetic north, and true north is expected"

@@ -21,6 +21,7 @@ TARGET, HERE, NOISE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0), (0.02, 0.02,
 BERGEN, THERE, DATE = (60.4, 5.3), (2.84, 73.05, 15003.0), {"date": "2026-06-30"}
 UPWARD = {"target_elements": (2.84, -73.05, 15003.0), "target_std": (0.5, 0.1, 20.0)}
 READINGS = "D,I,B_H,heading,distance"
+SPEEDS = "time,D,I,B_H,heading,speed"
 
 
 def start(target: Any = TARGET, here: Any = None, navigator: Any = "anywhere", **known: Any) -> Onboard:
@@ -45,7 +46,7 @@ def written(*lines: str) -> Path:
 
 
 def readings(*lines: str, **columns: str) -> Any:
-    return read_readings(written(*lines), {name: name for name in READINGS.split(",")} | columns, "time")
+    return read_readings(written(*lines), {name: name for name in [*READINGS.split(","), "speed"]} | columns, "time")
 
 
 ELEMENTS = {
@@ -112,10 +113,26 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (read_readings, ("none.csv", {}), {}, "cannot read none.csv: .*No such file"),
     (readings, (READINGS, "1,70,15000,0,0"), {}, "cannot read log.csv: it must hold at least two rows"),
     (readings, (READINGS, *["1,70,x,0,0"] * 2), {}, "row 1, B_H: 'x' is not a number"),
-    (readings, (READINGS, *["1,70,15000,0,-1"] * 2), {}, "distance -1 is not from 0 to 40000 km"),
+    (readings, (READINGS, *["1,70,15000,0,-1"] * 2), {}, "row 1, distance -1 is not from 0 to 40000 km"),
+    (readings, (SPEEDS, *["0,1,70,15000,0,6", "9,1,70,15000,0,-6"]), {}, "row 2, speed -6 is not from 0 to 1000 m_s"),
+    (readings, (READINGS, *["1,70,15000,0,0", "1,70,15000,400,9"]), {}, "row 2, heading 400 is not from -360 to 360"),
+    (readings, (SPEEDS[5:], *["1,70,15000,0,6"] * 2), {}, "speeds need a column 'time' of times"),
+    (readings, (READINGS[:-9], *["1,70,15000,0"] * 2), {}, r"distance or the speed .*\['D', 'I', 'B_H', 'heading'\]"),
+    (
+        readings,
+        (READINGS.replace(",", ";"), *["1,5;70,1;15000;0;0"] * 2),
+        {},
+        "the columns .*D;I;B_H;heading;distance.*, as with decimal commas",
+    ),
     (readings, (READINGS, *["1,70,15000,0,0"] * 2), {"I": "dip"}, "no column is 'dip': name the column of I, one of"),
 ]
 """Doors, arguments, and messages."""
+
+
+def test_a_speed_gives_the_length_of_a_leg(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    log = readings(f"{SPEEDS}_kn", "0,1,70,15000,0,0", "3600,1,70,15000,0,10", "5400,1,70,15000,0,12")
+    assert log["distance"].tolist() == pytest.approx([0, 18.52, 11.112])
 
 
 @pytest.mark.parametrize("row", range(len(MISTAKES)))

@@ -14,7 +14,7 @@ from magrl.field import IGRF, elements_at
 from magrl.field.elements import axes_of_elements, elements_of_axes
 from magrl.geodesy import move
 from magrl.sensor_std import OUTAGE_STD
-from magrl.vehicle.logs import difference_from_igrf, mistakes
+from magrl.vehicle.logs import check_speeds, difference_from_igrf, mistakes
 
 DATE = "2026-06-30"
 
@@ -106,3 +106,38 @@ def test_the_altitude_counts() -> None:
 def test_moves_are_compared_without_a_date() -> None:
     (text,) = mistakes(log().assign(D=0.0, heading=log()["heading"] + 180))
     assert text.endswith(": the heading is reciprocal, or the vehicle goes astern")
+
+
+STEP_S = 3000.0
+TIMED = T.assign(row=T.index + 1)
+LATITUDE, LONGITUDE = (T[name].where(T.index != 4, 0.0) for name in ("latitude", "longitude"))
+
+
+@pytest.mark.parametrize(
+    ("table", "step_s", "text"),
+    [
+        (
+            TIMED,
+            STEP_S / 86400,
+            r"row 2: a leg of 20 km in 0\.03.* s is 576000 m/s.*: times must be in seconds",
+        ),  # days
+        (TIMED.assign(distance=TIMED["distance"].cumsum()), STEP_S, r"row [34]: .* those since the start"),
+        (TIMED.assign(latitude=LATITUDE, longitude=LONGITUDE), STEP_S, "row 5: .*: a position of 0, 0 stands for none"),
+        (TIMED.assign(distance=TIMED["distance"].where(T.index != 5, 44.0)), 6600, "row 6: .*: the clock jumps there"),
+        (TIMED.assign(distance=TIMED["distance"] * 3.28), 600, "row 2: .*: check the units of times, speeds"),
+    ],
+)
+def test_impossible_speeds_are_refused_with_their_cause(table, step_s: float, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        check_speeds(table, np.full(15, step_s))
+
+
+def test_currents_and_satellites_are_possible() -> None:
+    """A ship in a current of 3 m/s, a glider that an eddy carries, an aircraft in the jet stream, a satellite."""
+    for factor, step_s in ((1.45, 3000.0), (5.0, 70_000.0), (0.67, 80.0)):
+        check_speeds(TIMED.assign(distance=TIMED["distance"] / factor), np.full(15, step_s))
+    check_speeds(TIMED.assign(altitude=450.0), np.full(15, 20 / 7.6))
+
+
+def test_longitudes_to_the_west_are_named() -> None:
+    assert mistakes(T.assign(longitude=-T["longitude"]))[0].endswith("longitudes are positive to the west")
