@@ -17,7 +17,6 @@ from pathlib import Path
 
 from magrl import tracking
 from magrl.envs import GeomagneticNavEnv
-from magrl.tracking.pilot import step
 from magrl.transforms.track import reading_of
 
 import torch
@@ -67,7 +66,6 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
         ),
         "posterior of the destination": lambda: tracking.posterior(goal),
         "track: belief, posterior and plan": lambda: tracking.advance(rules, track.state, after),
-        "track, where some vehicles start": lambda: step(rules, track.state, after),
         "declaration of the arrival": lambda: tracking.declaring(declared, track, after, track.plan),
     }
 

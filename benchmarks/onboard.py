@@ -7,6 +7,7 @@ import math
 from benchmarks.timing import HEADER, Row, alternate, one_thread
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
+from magrl.navigators import policy_env
 from magrl.vehicle.onboard import Onboard
 
 import torch
@@ -19,8 +20,9 @@ class Simulated:
     """A navigator in the environment with one vehicle, one episode after the other; it keeps what it flew."""
 
     def __init__(self, name: str) -> None:
-        self.env = GeomagneticNavEnv(num_envs=1, seed=0)
-        self.policy = make_navigator(name, self.env)
+        base = GeomagneticNavEnv(num_envs=1, seed=0)
+        self.policy = make_navigator(name, base)
+        self.env = policy_env(base, self.policy)
         self.state = self.env.reset()
         self.flown: list[TensorDictBase] = []
 

@@ -42,7 +42,6 @@ from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
 
-import torch
 import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -175,7 +174,7 @@ def evaluate(config: Config) -> str:
         began = time.perf_counter()
         rollout = flight.fly(navigator).cpu()
         measured = episode_measures(rollout)
-        readings = getattr(navigator, "field_readings", torch.zeros(1)).double().mean().item()
+        readings = getattr(navigator, "readings_per_step", 0) * measured["steps"].double().mean().item()
         summary = summarize(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
         number = len(results.summaries.setdefault(name, []))
         results.summaries[name].append(summary)

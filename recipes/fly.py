@@ -29,10 +29,9 @@ from magrl.evaluation.navigators import needs
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
-from magrl.tracking import Rules, Way
+from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
-from magrl.transforms import TrackField, conditions_named
-from magrl.transforms.track import known_keys
+from magrl.transforms import conditions_named
 
 import torch
 import tyro
@@ -40,7 +39,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl import torchrl_logger
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 RECIPE = "fly.py"
@@ -128,7 +127,7 @@ def check_files(config: Config) -> None:
         check_writable(config.out / name)
 
 
-def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
+def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
     """Return environment and navigator of a vehicle with an arrival signal and without.
 
     Raises:
@@ -158,20 +157,15 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
                 seed=config.seed,
                 arrival=arrival,
             )
-            flights[name] = with_estimates(flight), Watched(flight.navigator(config.navigator), distance_km)
+            navigator = flight.navigator(config.navigator)
+            flights[name] = flight.env_of(navigator, track=True), Watched(navigator, distance_km)
         check_files(config)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     return flights
 
 
-def with_estimates(flight: Flight) -> TransformedEnv:
-    """Return the environment of a flight with estimates of the displacement."""
-    track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
-    return TransformedEnv(flight.env, track, auto_unwrap=True)
-
-
-def rollout(env: TransformedEnv, navigator: Watched, start_heading: float | Literal["random"]) -> TensorDictBase:
+def rollout(env: EnvBase, navigator: Watched, start_heading: float | Literal["random"]) -> TensorDictBase:
     """Return the steps of the flight, ``(1, T)``."""
     state = env.reset()
     if start_heading != "random":

@@ -42,25 +42,25 @@ BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direc
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
 
 
-class Detour(TensorDictModuleBase):
+class Detour(Navigator):
     """Follow the shortest path around the no-go areas, through points beside their edges: an oracle."""
 
-    in_keys, out_keys = ["true_way", "heading", "no_go_areas"], ["action"]
+    in_keys = ["true_way", "heading", "no_go_areas", "elapsed_steps"]
     BESIDE_KM, POINTS = 3.0, 12
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        heading, numbers = tensordict["heading"], tensordict["no_go_areas"]
-        centers, radii = self._known(tensordict)
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+        """Return the action."""
+        heading, numbers = seen["heading"], seen["no_go_areas"]
+        centers, radii = self._known(seen, memory)
         leg = self._next(numbers[..., -2:], centers, radii)
         ahead = turned(leg, -heading)
         turn = torch.atan2(ahead[..., 1], ahead[..., 0])
         length = torch.where(turn.abs() > math.pi / 2, 0.0, leg.norm(dim=-1).clamp(max=50.0))
-        return tensordict.set("action", torch.stack((length, turn.clamp(-math.pi / 2, math.pi / 2)), -1))
+        return torch.stack((length, turn.clamp(-math.pi / 2, math.pi / 2)), -1)
 
-    def _known(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _known(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         """Return centers and radii of the areas that it goes around."""
-        return NoGoAreas.discs(tensordict["no_go_areas"])
+        return NoGoAreas.discs(seen["no_go_areas"])
 
     def _next(self, place: Tensor, centers: Tensor, radii: Tensor) -> Tensor:
         """Return the first leg of the shortest path, ``(..., 2)`` [km]."""
@@ -83,12 +83,15 @@ class Sighted(Detour):
 
     FAR_KM = 1e4
 
-    def _known(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        centers, radii = super()._known(tensordict)
-        gap_km = (centers - tensordict["no_go_areas"][..., None, -2:]).norm(dim=-1) - radii
-        seen = (gap_km < SIGHT_KM) & (gap_km <= gap_km.kthvalue(SEEN, keepdim=True).values)
-        self.seen = torch.where(tensordict["elapsed_steps"] > 0, seen | getattr(self, "seen", seen), seen)
-        return torch.where(self.seen.unsqueeze(-1), centers, self.FAR_KM), radii
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        return {"sighted": torch.zeros_like(NoGoAreas.discs(seen["no_go_areas"])[1], dtype=torch.bool)}
+
+    def _known(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        centers, radii = super()._known(seen, memory)
+        gap_km = (centers - seen["no_go_areas"][..., None, -2:]).norm(dim=-1) - radii
+        sighted = (gap_km < SIGHT_KM) & (gap_km <= gap_km.kthvalue(SEEN, keepdim=True).values)
+        memory["sighted"] = memory["sighted"] | sighted
+        return torch.where(memory["sighted"].unsqueeze(-1), centers, self.FAR_KM), radii
 
 
 class Around(TensorDictModuleBase):

@@ -24,17 +24,14 @@ from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import label
 from magrl.field import IGRF, elements_gradient_at
 from magrl.files import check_writable, read_text, write_text, write_with
-from magrl.tracking import Rules
 from magrl.training import UsageError, command
-from magrl.transforms import Conditions, TrackField, load_conditions
-from magrl.transforms.track import known_keys
+from magrl.transforms import Conditions, load_conditions
 
 import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
-from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -198,8 +195,8 @@ def place_error(tasks: int = 64) -> Figures:
     sea = sea.with_tasks(sea.random_tasks(tasks, 5))
     for axes, name in zip(figure.subplots(1, 3, sharex=True), ("ship", "underwater", "low-cost"), strict=True):
         flight = Flight(sea, errors=name, arrival="declared", **told)
-        track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
-        flown = evaluation_rollout(TransformedEnv(flight.env, track), flight.navigator("dead_reckoning"))["next"]
+        reckoning = flight.navigator("dead_reckoning")
+        flown = evaluation_rollout(flight.env_of(reckoning, track=True), reckoning)["next"]
         for (given, error), color in zip(place_errors(flown).items(), ("#000000", "#0072B2"), strict=True):
             low, middle, high = error.nanquantile(torch.tensor([0.25, 0.5, 0.75]).double(), 0)
             path = flown["move"][..., 0].cumsum(1).nanmean(0)

@@ -27,11 +27,9 @@ from magrl.field import IGRF, FieldModel
 from magrl.field.elements import UNITS
 from magrl.files import write_with
 from magrl.geodesy import geodesic
-from magrl.tracking import Rules
 from magrl.training import command
-from magrl.transforms import CONDITIONS, TrackField
+from magrl.transforms import CONDITIONS
 from magrl.transforms.areas import outlines
-from magrl.transforms.track import known_keys
 
 import numpy as np
 import torch
@@ -43,7 +41,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 sys.path.insert(0, str(Path(__file__).parent))
 from bars import flown
@@ -104,8 +101,8 @@ def trips() -> tuple[Tensor, dict[str, tuple[Trip, int]]]:
     auv, made = replace(CONDITIONS["underwater"], north={"constant_deg": 0.5}), {}
     for name, belief in (("dead_reckoning", "compass and log"), ("kalman", "and IGRF-13")):
         flight = Flight(scenario, errors=auv, model="IGRF-13", start_km=5.0, confidence=0.8)
-        track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
-        steps = evaluation_rollout(TransformedEnv(flight.env, track, auto_unwrap=True), flight.navigator(name))
+        navigator = flight.navigator(name)
+        steps = evaluation_rollout(flight.env_of(navigator, track=True), navigator)
         made[name] = Trip.of(steps[SHOWN], belief), int(episode_measures(steps)["success"].sum())
     return steps[SHOWN, 0]["target_position"].double(), made
 

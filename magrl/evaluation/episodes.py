@@ -21,9 +21,11 @@ from magrl.checks import check_number, check_tensor, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.measures import path_measures
 from magrl.geodesy import geodesic, wrap_angle
-from magrl.navigators import Navigator
+from magrl.navigators import Navigator, policy_env
+from magrl.navigators.base import MEMORY
 
-LARGE_KEYS = [(*root, "track", name) for root in ((), ("next",)) for name in ("state", "posterior")]
+_LARGE = (("track", "state"), ("track", "posterior"), (MEMORY,))
+LARGE_KEYS = [(*root, *key) for root in ((), ("next",)) for key in _LARGE]
 """Keys that rollouts leave out."""
 
 
@@ -35,12 +37,13 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
     are zeros, with a warning that names it.
 
     Args:
-        env: navigation environment, with transforms or without.
+        env: navigation environment, with transforms or without; :func:`~magrl.navigators.policy_env` adds what the
+            policy needs.
         policy: policy or navigator that writes ``action``.
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
-        What follows the end of an episode does not count. The state and the posterior of a
+        What follows the end of an episode does not count. Memories, and the state and the posterior of a
         :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are left out.
 
     Raises:
@@ -57,6 +60,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
         raise TypeError(f"policy must be callable with a TensorDict, got {policy!r}")
     if isinstance(policy, Navigator):
         policy.check_fits(env)
+    env = policy_env(env, policy)
     failed = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
@@ -158,7 +162,7 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.navigators import Secant
-        >>> rollout = GeomagneticNavEnv(num_envs=2, seed=0).rollout(50, Secant(), break_when_any_done=False)
+        >>> rollout = evaluation_rollout(GeomagneticNavEnv(num_envs=2, seed=0), Secant())
         >>> episodes = episode_measures(rollout)
         >>> episodes["success"], episodes["steps"]
         (tensor([True, True]), tensor([12, 12]))

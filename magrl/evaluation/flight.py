@@ -10,16 +10,18 @@ from typing import Any, TypeAlias
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_choice, check_device
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout
-from magrl.evaluation.navigators import fitted, make_navigator
+from magrl.evaluation.navigators import make_navigator
+from magrl.navigators import Navigator, policy_env
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import EarthModel, earth_model
-from magrl.transforms import Conditions, KnownPlace, conditions_named, with_conditions
+from magrl.tracking import EarthModel, Rules, earth_model
+from magrl.transforms import Conditions, KnownPlace, TrackField, conditions_named, with_conditions
 from magrl.transforms.errors.conditions import MAGNETIC
+from magrl.transforms.track import known_keys
 
 Errors: TypeAlias = Conditions | Sequence[float] | str | Path
 NORTHS = ("true", MAGNETIC)
@@ -111,9 +113,6 @@ class Flight:
     def navigator(self, policy: TensorDictModuleBase | str, **options: Any) -> TensorDictModuleBase:
         """Return a policy that flies within the limits of the environment, with the accuracy of its sensors.
 
-        With arrival ``"declared"``, navigators and trained agents declare from a track of their own readings; another
-        policy writes the third action itself.
-
         Args:
             policy: policy or navigator of the plain environment, or the text that names one, as
                 :func:`magrl.evaluation.navigators.make_navigator` takes it.
@@ -124,7 +123,24 @@ class Flight:
         """
         if isinstance(policy, str):
             policy = make_navigator(policy, self.base, sensor_std=self.sensor_std, **{"seed": self.seed} | options)
-        return fitted(policy, self.base, **self.rules)
+        return policy.fitted(self.base, self.rules) if isinstance(policy, Navigator) else policy
+
+    def env_of(self, policy: TensorDictModuleBase, *, track: bool = False) -> EnvBase:
+        """Return the environment with what a policy reads, as :func:`~magrl.navigators.policy_env` does.
+
+        With arrival ``"declared"``, navigators and trained agents declare from a track of their own readings; another
+        policy writes the third action itself.
+
+        Args:
+            policy: policy or navigator.
+            track: whether to add the track of the vehicle (:class:`~magrl.transforms.TrackField`) for any policy.
+        """
+        env = policy_env(self.env, policy, **self.rules)
+        if not track or "track" in env.observation_spec.keys():  # noqa: SIM118 - a Composite is no mapping
+            return env
+        rules = Rules(**self.base.limits | self.rules)
+        estimates = TrackField(rules, known_keys(env.observation_spec), out_keys=["track"])
+        return TransformedEnv(env, estimates, auto_unwrap=True)
 
     def fly(self, policy: TensorDictModuleBase | str) -> TensorDict:
         """Return a rollout of the first episode of each vehicle, as :func:`evaluation_rollout` does.
@@ -136,7 +152,8 @@ class Flight:
             TypeError: for a policy that is not callable.
             ValueError: as :meth:`navigator`.
         """
-        return evaluation_rollout(self.env, self.navigator(policy))
+        policy = self.navigator(policy)
+        return evaluation_rollout(self.env_of(policy), policy)
 
 
 def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, **options: Any) -> TensorDict:

@@ -12,7 +12,7 @@ from magrl.agents import load_policy
 from magrl.agents.policy import TrainingSettings
 from magrl.checks import check_type, printable
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Memory, Navigator
+from magrl.navigators import NAVIGATORS, Anywhere, Memory, Navigator
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.network import policy_content
 
@@ -218,20 +218,6 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
         return load_policy(path, env.device).fitted(env, {})
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from error
-
-
-def fitted(policy: TensorDictModuleBase, env: GeomagneticNavEnv, **rules: Any) -> TensorDictModuleBase:
-    """Return a policy within the limits of an environment, which declares its arrival where it must.
-
-    Args:
-        policy: any; the library's policies say themselves how they fit (:meth:`Navigator.fitted`).
-        env: environment.
-        **rules: further :class:`~magrl.tracking.Rules`, such as ``confidence``.
-    """
-    if not isinstance(policy, Navigator):
-        return policy
-    policy = policy.fitted(env, rules)
-    return Declaring(policy, **env.limits | rules) if env.arrival.declared and not policy.declares else policy
 
 
 def _kind(name: str) -> TrainedAgent | type[Navigator]:

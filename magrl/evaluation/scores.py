@@ -5,32 +5,28 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
-from torchrl.envs import InitTracker, TransformedEnv
 
 from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_choice, short
 from magrl.envs.navigation import NAMED_ENVS
+from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
-from magrl.evaluation.navigators import OWN, fitted, make_navigator, parse_navigator, policy_file
-from magrl.navigators import NAVIGATORS
+from magrl.evaluation.navigators import OWN, make_navigator, parse_navigator, policy_file
+from magrl.navigators import NAVIGATORS, Navigator
 
 SEED = paper.FIRST_RESERVED_SEED + 69
 """Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
 FAR_KM = 50
 """Distance from the destination beyond which the end of a success is far [km]: the longest leg of the paper."""
-Act = Callable[[NDArray[np.float32], Any, NDArray[np.bool_]], tuple[Any, Any]]
-"""From observations, state, and whether episodes start, to actions and the next state."""
 
 
 def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> dict[str, float]:
@@ -47,8 +43,8 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
             - any other TensorDict module, such as a navigator: it reads raw keys, and writes ``action`` in km and rad;
             - a model of stable-baselines3, or what else has their ``predict``;
             - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
-              ``act(observations, state)`` returns actions and the next state, which is None at the start. It gets no
-              other key.
+              ``act(observations, state)`` returns actions and the next state, which is None at the start: arrays with
+              the vehicles on their first or second axis, or a tuple, list or dict of them. It gets no other key.
         task: name in :data:`magrl.envs.navigation.NAMED_ENVS`: ``"box"``, ``"anywhere"``, ``"readings"``, ``"storm"``,
             ``"nogo"``.
         episodes: vehicles, each with one episode.
@@ -66,7 +62,7 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
 
     Example:
         >>> def straight(observations):
-        ...     return np.zeros((len(observations), 2))
+        ...     return 0 * observations[:, :2]
         >>> [score(agent, "box", episodes=8)["SR"] for agent in ("secant", straight)]
         [100.0, 0.0]
     """
@@ -80,11 +76,11 @@ def flown(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
     if isinstance(policy, str) or "observation" not in policy.in_keys:
         env = make(observation="dict", scale_actions=False)
         policy = make_navigator(policy, env.base_env) if isinstance(policy, str) else policy
-        return evaluation_rollout(env, fitted(policy, env.base_env))
+        return evaluation_rollout(env, policy.fitted(env.base_env, {}) if isinstance(policy, Navigator) else policy)
     env = make()
     if "observation" not in env.observation_spec.keys():  # noqa: SIM118 - a Composite is no mapping
         raise ValueError(f"the agent reads 'observation', which observation={options['observation']!r} leaves out")
-    return evaluation_rollout(_with_memory(env, policy), policy)
+    return evaluation_rollout(env, policy)
 
 
 def scored(rollout: TensorDictBase) -> dict[str, float]:
@@ -108,15 +104,15 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
     if isinstance(agent, TensorDictModuleBase):
         return agent
     if hasattr(agent, "predict"):
-        return _Arrays(lambda seen, state, first: agent.predict(seen, state, first, deterministic=True))
+        return ArrayPolicy(lambda seen, state, first: agent.predict(seen, state, first, deterministic=True))
     if isinstance(agent, nn.Module):
         return TensorDictModule(agent, ["observation"], ["action"])
     if not callable(agent):
         wanted = "the name or file of a navigator, a module, a model with predict, or a function of observations"
         raise TypeError(f"agent must be {wanted}, got {short(agent)}")
     if _takes_state(agent):
-        return _Arrays(lambda seen, state, _: agent(seen, state))
-    return _Arrays(lambda seen, *_: (agent(seen), None))
+        return ArrayPolicy(lambda seen, state, _: agent(seen, state))
+    return ArrayPolicy(lambda seen, *_: (agent(seen), None))
 
 
 def _takes_state(act: Callable[..., Any]) -> bool:
@@ -133,38 +129,5 @@ def _of_text(text: str) -> TensorDictModuleBase | str:
     if path.suffix != ".onnx" or not path.is_file() or has_view(content := path.read_bytes()):
         return text
 
-    def act(seen: NDArray[np.float32], state: Any, _: object) -> tuple[Any, Any]:
-        network = state or OnnxNetwork(content, seen.shape[-1])
-        return network(torch.from_numpy(seen)), network
-
-    return _Arrays(act)
-
-
-class _Arrays(TensorDictModuleBase):
-    """A function of arrays as a policy, which passes it the observation and no other key."""
-
-    in_keys, out_keys = ["observation", "elapsed_steps"], ["action"]
-
-    def __init__(self, act: Act) -> None:
-        super().__init__()
-        self.act, self.state = act, None
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        seen, first = (np.array(tensordict[key].cpu().numpy()) for key in self.in_keys)
-        actions, self.state = self.act(seen, self.state, first[:, 0] == 0)
-        array, count = np.asarray(actions), len(seen)
-        if array.shape not in [(count, 2), (count, 3)] or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-            wanted = f"finite numbers of shape ({count}, 2), a vehicle per row"
-            raise ValueError(f"actions must be {wanted}, got {array.dtype} {array.shape}: {short(array.tolist())}")
-        return tensordict.set("action", torch.from_numpy(array.astype(np.float32)).to(tensordict.device))
-
-
-def _with_memory(env: TransformedEnv, policy: TensorDictModuleBase) -> TransformedEnv:
-    """Return an environment with the memory of the recurrent modules of a policy."""
-    if "is_init" in policy.in_keys:
-        env.append_transform(InitTracker())
-    for module in policy.modules():
-        if hasattr(module, "make_tensordict_primer"):
-            env.append_transform(module.make_tensordict_primer())
-    return env
+    network = lru_cache(partial(OnnxNetwork, content))
+    return ArrayPolicy(lambda seen, *_: (network(seen.shape[-1])(torch.from_numpy(seen)), None))

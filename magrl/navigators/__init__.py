@@ -1,11 +1,11 @@
-"""Navigators: policies without training, each with its memory of the track."""
+"""Navigators: policies without training; what they remember is in the TensorDict."""
 
 from __future__ import annotations
 
 from magrl.navigators.base import Navigator as Navigator
+from magrl.navigators.base import policy_env as policy_env
 from magrl.navigators.dead_reckoning import DeadReckoning as DeadReckoning
 from magrl.navigators.kalman import Anywhere as Anywhere
-from magrl.navigators.kalman import Declaring as Declaring
 from magrl.navigators.kalman import Kalman as Kalman
 from magrl.navigators.memory import Memory as Memory
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm

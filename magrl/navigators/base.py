@@ -8,19 +8,28 @@ vehicle has not been, has ``oracle = True``; ``needs`` states what it knows besi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-from torchrl.envs import EnvBase
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform, TransformedEnv
 
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import element_index
 from magrl.sensor_std import PERFECT, STD_KEYS, SensorStd
+from magrl.tracking import Rules
+from magrl.transforms import DeclareArrival, TrackField
+from magrl.transforms.track import known_keys
+
+MEMORY = "memory"
+"""Key of what a policy remembers of its episode."""
+_REMEDY = "policy_env(env, policy) returns the environment that has it"
 
 
 def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
@@ -62,13 +71,13 @@ def element_indices(elements: Sequence[str], least: int) -> list[int]:
 
 
 class Navigator(TensorDictModuleBase):
-    """Base class of untrained policies: action bounds, and a memory of each vehicle for the length of an episode.
+    """Base class of untrained policies: action bounds, and a memory of the episode in the TensorDict.
 
-    A subclass sets its ``in_keys``, returns the memory at the start of an episode (``elapsed_steps`` 0) in
-    :meth:`first_memory`, and chooses the next leg in :meth:`decide`. :meth:`decide` is called once for each step of a
-    vehicle, so that calling the navigator twice on one state changes nothing; if ``done`` is among the ``in_keys``, it
-    is not called after the end of an episode. With the class attributes below, and a place in the list of
-    :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
+    A subclass sets its ``in_keys``, and chooses the next leg in :meth:`decide`. A navigator that remembers returns its
+    memory at the start of an episode (``elapsed_steps`` 0) in :meth:`first_memory`; it reads ``("memory", ...)`` and
+    writes ``("next", "memory", ...)``, as recurrent modules of TorchRL do, so that its actions depend on the TensorDict
+    alone. :func:`policy_env` adds these keys to an environment. With the class attributes below, and a place in the
+    list of :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
 
     Args:
         max_move_km: longest leg [km].
@@ -81,14 +90,12 @@ class Navigator(TensorDictModuleBase):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.geodesy import steer
         >>> class DueEast(Navigator):
-        ...     def __init__(self):
-        ...         super().__init__(max_move_km=50.0, max_turn_rad=math.pi / 2)
-        ...         self.in_keys = ["heading", "elapsed_steps"]
+        ...     in_keys = ["heading", "elapsed_steps"]
         ...
         ...     def decide(self, seen, memory):
         ...         heading = seen["heading"].squeeze(-1)
-        ...         east, way = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
-        ...         return steer(heading, east, way, self.max_move_km, self.max_turn_rad)
+        ...         east, distance = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
+        ...         return steer(heading, east, distance, self.max_move_km, self.max_turn_rad)
         >>> GeomagneticNavEnv(num_envs=1, seed=0).rollout(2, DueEast())["action"].round(decimals=2)
         tensor([[[30.0000,  1.5700],
                  [30.0000,  0.0000]]])
@@ -110,6 +117,8 @@ class Navigator(TensorDictModuleBase):
     """Keys that :meth:`decide` reads where an environment has them."""
     action_size = 2
     """Numbers of the action: 3 with a declaration of the arrival."""
+    readings_per_step = 0
+    """Readings of the field at places where the vehicle has not been, in each step."""
     options: tuple[str, ...] = ()
     """Further options of :meth:`for_env` that a command has: ``seed``."""
 
@@ -119,13 +128,16 @@ class Navigator(TensorDictModuleBase):
         check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
         self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
         self.out_keys = ["action"]
-        self.memory: TensorDictBase | None = None
-        self._remembers = False
 
     @property
     def declares(self) -> bool:
         """Whether its action has a third number, which declares the arrival."""
         return self.action_size > 2
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it has a memory."""
+        return type(self).first_memory is not Navigator.first_memory
 
     @classmethod
     def for_env(
@@ -157,60 +169,107 @@ class Navigator(TensorDictModuleBase):
         self.check_fits(env)
         return self
 
+    def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:
+        """Return what an environment needs for it: see :func:`policy_env`."""
+        base, there = getattr(env, "base_env", env), MEMORY in env.observation_spec.keys()  # noqa: SIM118
+        declared = base.arrival.declared and not self.declares
+        primer = [self.make_tensordict_primer(env)] if self.remembers and not there else []
+        return primer + (track_transforms(env, Rules(**base.limits | rules)) if declared else [])
+
+    def make_tensordict_primer(self, env: EnvBase) -> TensorDictPrimer:
+        """Return the transform that adds its memory to an environment."""
+        observed = env.observation_spec.zero()
+        seen = observed.select(*self.in_keys, *self.optional_keys, strict=False)
+        return memory_primer(self.first_memory(seen), env)
+
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002
         """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``; none by default."""
         return {}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor] | Tensor:
-        """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory; or
-        the whole action ``(P, A)``."""
+        """Return distance [km] and turn [rad], each ``(N,)``, or the whole action ``(N, A)``; set what changes in the
+        memory."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]; with a declaration, ``(N, 3)``."""
-        seen = tensordict.select(*self.in_keys).update(tensordict.select(*self.optional_keys, strict=False))
-        self.memory = memory = self._recall(seen)
-        step = seen["elapsed_steps"].squeeze(-1)
-        if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done
-            memory["over"] = memory["over"] | seen["done"].squeeze(-1)
-            memory["action"] = torch.where(memory["over"].unsqueeze(-1), 0.0, memory["action"])
-        mark = _mark(seen.select(*self.in_keys).exclude("done"))
-        repeated = (step == memory["decided_at"]) & (mark == memory["mark"]).all(-1)
-        if self._remembers and (~repeated & ~memory["over"] & (memory["decided_at"] >= step)).any():
-            raise RuntimeError(f"{self.label} remembers other vehicles: each environment needs a navigator of its own")
-        rows = (~repeated & ~memory["over"]).nonzero().squeeze(-1)
-        if len(rows):
-            part = memory[rows]
-            chosen = self.decide(seen[rows], part)
-            action = chosen if isinstance(chosen, Tensor) else torch.stack(chosen, -1)
-            part["action"] = action.to(part["action"].dtype)
-            part["decided_at"], part["mark"] = step[rows], mark[rows]
-            memory[rows] = part
-        for key in self.out_keys:
-            tensordict.set(key, memory[key].clone())
-        return tensordict
+        seen = self._seen(tensordict)
+        memory = recalled(tensordict, partial(self.first_memory, seen)) if self.remembers else seen.empty()
+        chosen = self.decide(seen, memory)
+        action = chosen if isinstance(chosen, Tensor) else torch.stack(chosen, -1)
+        tensordict.set("action", action.to(torch.float32))
+        return tensordict.set(("next", MEMORY), memory) if self.remembers else tensordict
 
-    def _recall(self, seen: TensorDictBase) -> TensorDictBase:
-        """Return the memory of the batch, reset where an episode starts."""
-        step, memory = seen["elapsed_steps"].squeeze(-1), self.memory
-        known = memory is not None and memory.shape == step.shape and memory.device == step.device
-        if memory is not None and known and not (step == 0).any():
-            return memory
-        common = {"action": torch.zeros(len(step), self.action_size, dtype=torch.float32, device=step.device)}
-        common |= {"decided_at": torch.full_like(step, -1), "field_readings": torch.zeros_like(step)}
-        common |= {"over": torch.zeros_like(step, dtype=torch.bool)}
-        common |= {"mark": torch.zeros_like(_mark(seen.select(*self.in_keys).exclude("done")))}
-        own = self.first_memory(seen)
-        self._remembers = bool(own)
-        first = TensorDict(own | common, batch_size=step.shape, device=step.device)
-        return torch.where(step == 0, first, memory) if memory is not None and known else first
-
-    @property
-    def field_readings(self) -> Tensor:
-        """``(N,)`` int64: readings of the field in this episode at places where the vehicle has not been."""
-        return torch.zeros(0, dtype=torch.int64) if self.memory is None else self.memory["field_readings"]
+    def _seen(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return what it reads; raise a KeyError that names what is missing."""
+        try:
+            return tensordict.select(*self.in_keys).update(tensordict.select(*self.optional_keys, strict=False))
+        except KeyError as error:
+            missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+            raise KeyError(f"{type(self).__name__} reads {missing}: {_REMEDY}") from error
 
 
-def _mark(seen: TensorDictBase) -> Tensor:
-    """Return all that vehicles see ``(N, K)``, by which a second call for one step is told from another batch."""
-    return torch.cat([value.double().flatten(1) for value in seen.values(True, True)], -1).nan_to_num()
+def recalled(tensordict: TensorDictBase, first: Callable[[], Mapping[str, Tensor]]) -> TensorDictBase:
+    """Return a copy of the memory of a policy; in each row that starts an episode it is the ``first`` one ``(N, ...)``.
+
+    Raises:
+        KeyError: for a TensorDict without the memory.
+
+    Example:
+        >>> steps, memory = torch.tensor([[0], [4]]), TensorDict({"path": [30.0, 90.0]}, 2)
+        >>> state = TensorDict({"elapsed_steps": steps, "memory": memory}, 2)
+        >>> recalled(state, lambda: {"path": torch.zeros(2)})["path"]
+        tensor([ 0., 90.])
+    """
+    memory = tensordict.get(MEMORY, None)
+    if memory is None:
+        raise KeyError(f"the policy reads its {MEMORY!r}, which is not in the TensorDict: {_REMEDY}")
+    begins = tensordict["elapsed_steps"].squeeze(-1) == 0
+    if not begins.any():
+        return memory.copy()
+    start = TensorDict(dict(first()), batch_size=begins.shape, device=begins.device)
+    return start if begins.all() else torch.where(begins, start, memory)
+
+
+def memory_primer(first: Mapping[str, Tensor], env: EnvBase) -> TensorDictPrimer:
+    """Return the transform that adds a memory, such as ``first`` ``(N, ...)``, to an environment of N vehicles."""
+    leaves = {key: Unbounded(value.shape, dtype=value.dtype, device=env.device) for key, value in first.items()}
+    spec = Composite(leaves, shape=env.batch_size, device=env.device)
+    whole = Composite({MEMORY: spec}, shape=env.batch_size, device=env.device)
+    return TensorDictPrimer(whole, reset_key="_reset")
+
+
+def track_transforms(env: EnvBase, rules: Rules) -> list[Transform]:
+    """Return the track of a vehicle, and where it must declare its arrival, the declaration; a track that is there is
+    used."""
+    known, keys = known_keys(env.observation_spec), env.observation_spec.keys()
+    track = [] if "track" in keys else [TrackField(rules, known, out_keys=["track"])]
+    declare = [] if rules.signaled or "arrival_probability" in keys else [DeclareArrival(rules, known)]
+    return [*track, *declare]
+
+
+def policy_env(env: EnvBase, policy: nn.Module, **rules: Any) -> EnvBase:
+    """Return an environment with what a policy reads beside observations: its memory, or the track of its vehicle.
+
+    Where vehicles must declare their arrival and a navigator does not, the track declares it
+    (:class:`~magrl.transforms.DeclareArrival`).
+
+    Args:
+        env: navigation environment, with transforms or without.
+        policy: navigator, recurrent module of TorchRL, or a module that holds them; others need nothing.
+        **rules: values of :class:`~magrl.tracking.Rules` beside the limits of the environment, such as ``confidence``.
+
+    Example:
+        >>> from magrl.navigators import Secant
+        >>> env, secant = GeomagneticNavEnv(num_envs=2, seed=0), Secant()
+        >>> policy_env(env, secant).rollout(5, secant)["memory", "visited"].shape
+        torch.Size([2, 5, 24, 2])
+    """
+    steps: list[Transform] = []
+    modules: Any = policy.modules() if isinstance(policy, nn.Module) else ()
+    for module in modules:
+        if isinstance(module, Navigator):
+            steps += module.transforms(env, **rules)
+        elif hasattr(module, "make_tensordict_primer") and "is_init" not in env.observation_spec.keys():  # noqa: SIM118
+            steps += [InitTracker(), module.make_tensordict_primer()]
+    return TransformedEnv(env, Compose(*steps), auto_unwrap=True) if steps else env

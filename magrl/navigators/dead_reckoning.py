@@ -35,8 +35,10 @@ class DeadReckoning(Navigator):
         chart: model of the Earth (:func:`magrl.tracking.earth_model`), of which it reads the declination.
 
     Example:
-        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> bool(env.rollout(50, DeadReckoning(), break_when_any_done=False)["next", "success"].any(1).all())
+        >>> from magrl.navigators import policy_env
+        >>> env, reckoning = GeomagneticNavEnv(num_envs=2, seed=0), DeadReckoning()
+        >>> flown = policy_env(env, reckoning).rollout(50, reckoning, break_when_any_done=False)
+        >>> bool(flown["next", "success"].any(1).all())
         True
     """
 

@@ -90,8 +90,9 @@ class Memory(Navigator):
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
-        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env.rollout(3, Memory(MemoryNetwork(8)))["action"].shape
+        >>> from magrl.navigators import policy_env
+        >>> env, memory = GeomagneticNavEnv(num_envs=2, seed=0), Memory(MemoryNetwork(8))
+        >>> policy_env(env, memory).rollout(3, memory)["action"].shape
         torch.Size([2, 3, 2])
     """
 

@@ -19,11 +19,13 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.checks import check_number
+from magrl.counters import advanced, counter_stream, normal_of, stream_uniform
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import move, wrap_angle
 from magrl.navigators.base import Navigator
 from magrl.sensor_std import SensorStd
+from magrl.transforms.errors.base import EPISODE_STREAM
 
 Evaluate = Callable[[Tensor], Tensor]
 """From candidates ``(N, K, 2)`` to their fitness ``(N, K)``."""
@@ -79,8 +81,34 @@ def in_disc(candidate: Tensor) -> Tensor:
     return candidate / candidate.norm(dim=-1, keepdim=True).clamp_min(1)
 
 
+class Draws:
+    """Random numbers of vehicles in one step, a pure function of their streams.
+
+    Args:
+        stream: ``(N,)`` of :func:`magrl.counters.counter_stream`.
+
+    Example:
+        >>> draws = Draws(torch.tensor([5, 5]))
+        >>> bool((draws.uniform(3)[0] == draws.uniform(3)[1]).any())
+        False
+    """
+
+    def __init__(self, stream: Tensor) -> None:
+        self.stream = stream
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Return the next uniform numbers in [0, 1) of each vehicle, ``(N, *shape)`` float64."""
+        count = math.prod(shape)
+        numbers, self.stream = stream_uniform(self.stream, count), advanced(self.stream, count)
+        return numbers.unflatten(-1, shape)
+
+    def normal(self, *shape: int) -> Tensor:
+        """Return the next standard normal numbers of each vehicle, ``(N, *shape)`` float64."""
+        return normal_of(self.uniform(*shape))
+
+
 class Metaheuristic(Navigator):
-    """Base class of the metaheuristics: individuals as legs, the search for the best, random numbers.
+    """Base class of the metaheuristics: individuals as legs, and the search for the best.
 
     A subclass initializes its state (:meth:`begin`) and computes the next generation (:meth:`evolve`). Its numbers are
     class attributes, from a sweep: with the highest SPL, or with a third of the readings for 0.1 % less.
@@ -89,15 +117,15 @@ class Metaheuristic(Navigator):
         field: field model.
         max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
-        seed: seed of the random numbers.
+        seed: seed of the random numbers, which are those of a vehicle, an episode and a step.
 
     Raises:
         ValueError: for any option out of its range, naming it and its value.
 
     Example:
         >>> class RandomSearch(Metaheuristic):
-        ...     def evolve(self, state, fitness, evaluate):
-        ...         return {"population": self.first_state(fitness)["population"]}
+        ...     def evolve(self, state, fitness, evaluate, draws):
+        ...         return {"population": self.first_state(draws)["population"]}
         >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
         >>> env.rollout(3, RandomSearch(env.field))["action"].shape
@@ -119,8 +147,9 @@ class Metaheuristic(Navigator):
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
         check_number(whole=True, seed=seed)
-        self.field, self.generator = field, torch.Generator().manual_seed(seed)
+        self.field, self.seed = field, int(seed)
         self.in_keys = ["target_field", "heading", "elapsed_steps", "position", "objective_weights", "done"]
+        self.in_keys += [EPISODE_STREAM]
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
@@ -134,44 +163,45 @@ class Metaheuristic(Navigator):
         """Return the state of an algorithm beside its first population ``(N, P, 2)``: tensors ``(N, ...)``, or none."""
         return {}
 
-    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate) -> dict[str, Tensor]:
+    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate, draws: Draws) -> dict[str, Tensor]:
         """Return the next generation.
 
         Args:
             state: ``(N,)`` with ``population`` ``(N, P, 2)`` and the entries of :meth:`begin`.
             fitness: ``(N, P)`` fitness of that population.
             evaluate: fitness of more candidates.
+            draws: random numbers.
         """
         raise NotImplementedError
 
-    # Random numbers, drawn on the CPU so that a seed gives the same episodes on every device
+    @property
+    def readings_per_step(self) -> int:  # type: ignore[override]
+        """Readings of the field at the ends of candidates, in each step."""
+        return self.generations * self.population_size
 
-    def uniform(self, like: Tensor, *shape: int) -> Tensor:
-        """Return uniform numbers in [0, 1), float64."""
-        return torch.rand(shape, generator=self.generator, dtype=torch.float64).to(like.device)
-
-    def normal(self, like: Tensor) -> Tensor:
-        """Return standard normal numbers in the shape of ``like``, float64."""
-        return torch.randn(like.shape, generator=self.generator, dtype=torch.float64).to(like.device)
-
-    def first_state(self, like: Tensor) -> TensorDictBase:
-        """Return a population uniform over a disc of legs, for each of the ``N`` vehicles of ``like``."""
-        radius, angle = self.uniform(like, 2, len(like), self.population_size)
+    def first_state(self, draws: Draws) -> TensorDictBase:
+        """Return a population uniform over a disc of legs for each of the ``N`` vehicles."""
+        radius, angle = draws.uniform(2, self.population_size).unbind(1)
         distance, heading = radius.sqrt(), 2 * math.pi * angle
         population = torch.stack((distance * torch.cos(heading), distance * torch.sin(heading)), -1)
-        state = {"population": population, **self.begin(population)}
-        return TensorDict(state, batch_size=[len(like)], device=like.device)
+        return TensorDict({"population": population, **self.begin(population)}, batch_size=draws.stream.shape)
 
-    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the best of all candidates of some generations."""
-        heading = seen["heading"].double()
-        readings = [0]
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:  # noqa: ARG002
+        """Return the best leg; none after the end of an episode, where a rollout steps on for other vehicles."""
+        action = torch.zeros(*seen.batch_size, 2, device=seen.device)
+        going = ~seen["done"].squeeze(-1)
+        action[going] = torch.stack(self._best(seen[going]), -1).float()
+        return action
+
+    def _best(self, seen: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return distance [km] and turn [rad] ``(N,)`` of the best of all candidates of some generations."""
+        heading, counters = seen["heading"].double(), torch.cat((seen[EPISODE_STREAM], seen["elapsed_steps"]), -1)
+        draws = Draws(counter_stream(self.seed, counters))
 
         def evaluate(candidate: Tensor) -> Tensor:
-            readings[0] += candidate.shape[1]
             return self._objective_at(seen, *reachable(candidate, heading, self.max_turn_rad))
 
-        state = self.first_state(heading)
+        state = self.first_state(draws)
         best, lowest = state["population"][:, :1], torch.full_like(heading, math.inf)
         for generation in range(self.generations):
             fitness = evaluate(state["population"])
@@ -179,8 +209,7 @@ class Metaheuristic(Navigator):
             lowest, index = values.min(1, keepdim=True)
             best = take(pool, index)
             if generation + 1 < self.generations:
-                state.update(self.evolve(state, fitness, evaluate))
-        memory["field_readings"] = memory["field_readings"] + readings[0]
+                state.update(self.evolve(state, fitness, evaluate, draws))
         distance, turn = reachable(best, heading, self.max_turn_rad)
         return distance.squeeze(-1) * self.max_move_km, turn.squeeze(-1)
 
@@ -219,23 +248,29 @@ class GeneticAlgorithm(Metaheuristic):
     tournament_size, mutation_rate, elites = 2, 0.3, 1
     """Individuals that compete to be a parent, share of coordinates that mutate, best individuals that are kept."""
 
-    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate) -> dict[str, Tensor]:  # noqa: ARG002
-        population = state["population"]
+    def evolve(
+        self,
+        state: TensorDictBase,
+        fitness: Tensor,
+        evaluate: Evaluate,  # noqa: ARG002
+        draws: Draws,
+    ) -> dict[str, Tensor]:
+        population, size = state["population"], self.population_size
         elite = take(population, fitness.topk(self.elites, dim=1, largest=False).indices)
-        first, second = (take(population, self._tournament(fitness)) for _ in range(2))
-        weight = (1 + 2 * BLEND) * self.uniform(population, *population.shape) - BLEND
-        crossed = self.uniform(population, *population.shape[:2], 1) < CROSSOVER_RATE
+        first, second = (take(population, self._tournament(fitness, draws)) for _ in range(2))
+        weight = (1 + 2 * BLEND) * draws.uniform(size, 2) - BLEND
+        crossed = draws.uniform(size, 1) < CROSSOVER_RATE
         children = torch.where(crossed, first + weight * (second - first), first)
-        mutated = self.uniform(population, *population.shape) < self.mutation_rate
-        children = children + mutated * MUTATION_SCALE * self.normal(children)
+        mutated = draws.uniform(size, 2) < self.mutation_rate
+        children = children + mutated * MUTATION_SCALE * draws.normal(size, 2)
         return {"population": torch.cat((elite, in_disc(children)[:, self.elites :]), 1)}
 
-    def _tournament(self, fitness: Tensor) -> Tensor:
+    def _tournament(self, fitness: Tensor, draws: Draws) -> Tensor:
         """Return the indices of the winners, one for each place in the next generation, ``(N, P)``."""
         size = fitness.shape[1]
-        draws = (size * self.uniform(fitness, len(fitness), size * self.tournament_size)).long()
-        winner = take(fitness, draws).unflatten(1, (size, -1)).argmin(-1, keepdim=True)
-        return draws.unflatten(1, (size, -1)).gather(-1, winner).squeeze(-1)
+        rivals = (size * draws.uniform(size * self.tournament_size)).long()
+        winner = take(fitness, rivals).unflatten(1, (size, -1)).argmin(-1, keepdim=True)
+        return rivals.unflatten(1, (size, -1)).gather(-1, winner).squeeze(-1)
 
 
 class ParticleSwarm(Metaheuristic):
@@ -267,13 +302,19 @@ class ParticleSwarm(Metaheuristic):
         lowest = torch.full_like(population[..., 0], math.inf)
         return {"velocity": torch.zeros_like(population), "best": population.clone(), "lowest": lowest}
 
-    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate) -> dict[str, Tensor]:  # noqa: ARG002
+    def evolve(
+        self,
+        state: TensorDictBase,
+        fitness: Tensor,
+        evaluate: Evaluate,  # noqa: ARG002
+        draws: Draws,
+    ) -> dict[str, Tensor]:
         population = state["population"]
         better = fitness < state["lowest"]
         lowest = torch.where(better, fitness, state["lowest"])
         best = torch.where(better.unsqueeze(-1), population, state["best"])
         leader = take(best, lowest.argmin(1, keepdim=True))
-        personal, shared = self.uniform(population, 2, *population.shape)
+        personal, shared = draws.uniform(2, *population.shape[1:]).unbind(1)
         pull = self.cognitive * personal * (best - population) + self.social * shared * (leader - population)
         velocity = (self.inertia * state["velocity"] + pull).clamp(-MAX_VELOCITY, MAX_VELOCITY)
         return {"population": in_disc(population + velocity), "velocity": velocity, "best": best, "lowest": lowest}
@@ -307,7 +348,12 @@ class ArtificialFishSwarm(Metaheuristic):
     """Range of sight and longest step of a fish, in longest legs; share of the population near a place above which that
     place is crowded; places that a preying fish evaluates before it steps at random."""
 
-    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate) -> dict[str, Tensor]:
+    @property
+    def readings_per_step(self) -> int:  # type: ignore[override]
+        """Readings at the fish, and between generations at the center of each and where it preys."""
+        return self.population_size * (self.generations + (self.generations - 1) * (1 + self.tries))
+
+    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate, draws: Draws) -> dict[str, Tensor]:
         fish = state["population"]
         near = (fish.unsqueeze(1) - fish.unsqueeze(2)).norm(dim=-1) < self.visual
         near = near & ~torch.eye(fish.shape[1], dtype=torch.bool, device=fish.device)
@@ -321,14 +367,14 @@ class ArtificialFishSwarm(Metaheuristic):
         follow = free & (leader_fitness < fitness) & (leader_fitness <= center_fitness)
         swarm = free & (center_fitness < fitness) & ~follow
         goal = torch.where(follow.unsqueeze(-1), take(fish, leader), center)
-        goal = torch.where((follow | swarm).unsqueeze(-1), goal, self._prey(fish, fitness, evaluate))
+        goal = torch.where((follow | swarm).unsqueeze(-1), goal, self._prey(fish, fitness, evaluate, draws))
         toward = goal - fish
-        length = self.step * self.uniform(fish, *fish.shape[:2], 1)
+        length = self.step * draws.uniform(self.population_size, 1)
         return {"population": in_disc(fish + toward * (length / toward.norm(dim=-1, keepdim=True).clamp_min(1e-9)))}
 
-    def _prey(self, fish: Tensor, fitness: Tensor, evaluate: Evaluate) -> Tensor:
+    def _prey(self, fish: Tensor, fitness: Tensor, evaluate: Evaluate, draws: Draws) -> Tensor:
         """Return the first better place in sight, or else the last one evaluated: ``(N, P, 2)``."""
-        places = fish.unsqueeze(2) + self.visual * (2 * self.uniform(fish, *fish.shape[:2], self.tries, 2) - 1)
+        places = fish.unsqueeze(2) + self.visual * (2 * draws.uniform(*fish.shape[1:2], self.tries, 2) - 1)
         better = evaluate(places.flatten(1, 2)).unflatten(1, (-1, self.tries)) < fitness.unsqueeze(-1)
         better[..., -1] = True
         first = better.long().argmax(-1)

@@ -213,7 +213,9 @@ class QuasiNewton(Navigator):
         ...         return GradientPrior(gradient, torch.tensor([[0.004], [0.01], [4.0]]).expand(3, 2))
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env.rollout(50, DipNavigator(50.0, 1.5))["next", "success"].any()
+        >>> from magrl.navigators import policy_env
+        >>> dip = DipNavigator(50.0, 1.5)
+        >>> policy_env(env, dip).rollout(50, dip)["next", "success"].any()
         tensor(True)
     """
 
@@ -407,7 +409,8 @@ class Secant(QuasiNewton):
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env.rollout(2, Secant())["action"][0].round(decimals=2)
+        >>> from magrl.navigators import policy_env
+        >>> policy_env(env, Secant()).rollout(2, Secant())["action"][0].round(decimals=2)
         tensor([[0.5000, 0.0000],
                 [0.5000, 1.5700]])
     """
@@ -460,7 +463,9 @@ class MeanJacobian(QuasiNewton):
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env.rollout(50, MeanJacobian(env.field, env.region.grid(21)))["next", "success"].any()
+        >>> from magrl.navigators import policy_env
+        >>> navigator = MeanJacobian(env.field, env.region.grid(21))
+        >>> policy_env(env, navigator).rollout(50, navigator)["next", "success"].any()
         tensor(True)
     """
 

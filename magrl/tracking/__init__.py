@@ -35,7 +35,6 @@ from magrl.tracking.observation import track_observation as track_observation
 from magrl.tracking.pilot import act as act
 from magrl.tracking.pilot import advance as advance
 from magrl.tracking.pilot import begin as begin
-from magrl.tracking.pilot import blank as blank
 from magrl.tracking.pilot import declaring as declaring
 from magrl.tracking.pilot import moving as moving
 from magrl.tracking.pilot import observation as observation

@@ -1,7 +1,7 @@
 """The step of a vehicle that navigates by its own readings: a reading and a record in, a record and an action out.
 
-:func:`begin` and :func:`advance` keep the record, :func:`act` chooses the leg, and all three are pure functions: the
-same ones run in simulation, on board and in training. A step in ten lines::
+:func:`begin` and :func:`advance` keep the record, :func:`act` chooses the leg, :func:`declaring` the end, and all are
+pure functions: the same ones run in simulation, on board and in training. A step in ten lines::
 
     beliefs = moved(beliefs, distance, heading, std, motion)        # dead reckoning of the field and the place
     new = innovation(beliefs, field, std.noise)                     # the reading minus its prediction
@@ -49,7 +49,7 @@ from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
 from magrl.tracking.observation import track_observation, turned
 from magrl.tracking.planning import corrected, planned_move, step_price
 from magrl.tracking.records import Reading, Rules, State, Track
-from magrl.tracking.search import VISITED, arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
+from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
 from magrl.tracking.survey import surveyed
 from magrl.tracking.way import Way
 
@@ -80,18 +80,6 @@ def advance(rules: Rules, state: State, reading: Reading) -> Track:
     counts less (:func:`~magrl.tracking.spike_factor`).
     """
     return _estimated(rules, reading, *_advanced(rules, state, reading))
-
-
-def step(rules: Rules, state: State, reading: Reading) -> Track:
-    """Return the track of vehicles of which some begin (step 0) and the others advance."""
-    first = reading.step == 0
-
-    def chosen(one: Tensor, other: Tensor) -> Tensor:
-        return torch.where(first.reshape((*first.shape, *[1] * (one.ndim - first.ndim))), one, other)
-
-    started, later = _started(rules, reading), _advanced(rules, state, reading)
-    state = State(*map(chosen, started[0], later[0]))
-    return _estimated(rules, reading, state, *(chosen(*parts) for parts in zip(started[1:], later[1:], strict=True)))
 
 
 def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
@@ -210,17 +198,6 @@ def _true(reading: Reading, north: Tensor) -> Reading:
     return reading._replace(heading=reading.heading + north.to(reading.heading), std=reading.std._replace(noise=noise))
 
 
-def blank(reading: Reading) -> State:
-    """Return a state of the right shapes before the first reading, of zeros."""
-    like, shape, count = reading.field, reading.field.shape[:-1], len(anomalies.SIZES_NT)
-    wide = {"mean": (count, STATES), "covariance": (count, STATES, STATES), "place": (2,), "log_weight": (count,)}
-    wide |= {"log_ratio": (count, 3), "readings": (count, 3)}
-    zeros = {name: like.new_zeros(*shape, *size, dtype=torch.float64) for name, size in wide.items()}
-    rest = {name: like.new_zeros(shape, dtype=torch.float64) for name in ("path", "north")}
-    rest["home"] = like.new_zeros(*shape, 2, dtype=torch.float64)
-    return State(**zeros, **rest, visited=like.new_zeros(*shape, VISITED, 2), weights=like.new_zeros(*shape, 3))
-
-
 def _goal(rules: Rules, state: State, reading: Reading) -> Destination:
     belief, crust, errors = state.belief, state.crust_nt, _true(reading, state.north).std
     std = None if rules.target_std is None else torch.tensor(rules.target_std, dtype=torch.float64)
@@ -278,11 +255,8 @@ def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:
     )
 
 
-def act(
-    rules: Rules, track: Track, reading: Reading, network: Callable[[Tensor], Tensor] | None = None
-) -> tuple[Tensor, ArrivalDecision | None]:
-    """Return the action of a track: distance [km] and turn [rad] ``(..., 2)``; with the declaration as a third number
-    and the decision behind it, where the vehicle must declare its arrival.
+def act(rules: Rules, track: Track, reading: Reading, network: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+    """Return the action of a track: distance [km] and turn [rad] ``(..., 2)``.
 
     Args:
         rules: rules.
@@ -292,8 +266,7 @@ def act(
             (:func:`~magrl.tracking.corrected`); None to fly as planned.
     """
     plan = track.plan if network is None else corrected(track.plan, network(observation(rules, track, reading)))
-    action = moving(rules, plan, _true(reading, track.state.north).heading)
-    return (action, None) if rules.signaled else declaring(rules, track, reading, action)
+    return moving(rules, plan, _true(reading, track.state.north).heading)
 
 
 def moving(rules: Rules, plan: Tensor, heading: Tensor) -> Tensor:

@@ -67,8 +67,8 @@ class TrackField(StatefulTransform):
 
     The nested key ``track`` has the state (float64, which a step reads from the TensorDict before it), the posterior of
     the displacement to the destination, its mean and covariance ``("track", "way", ...)`` [km], elements and gradients
-    ``("track", "local", ...)``, the aim and the planned leg ``(..., 2)`` [km]. ``observation`` is what a network
-    observes that corrects the plan. Nothing that it writes is privileged unless an input is.
+    ``("track", "local", ...)``, the aim and the planned leg ``(..., 2)`` [km]. ``observation``, which may be left out,
+    is what a network observes that corrects the plan. Nothing that it writes is privileged unless an input is.
 
     Args:
         rules: what the vehicle knows before it starts.
@@ -90,6 +90,7 @@ class TrackField(StatefulTransform):
     """
 
     default_out_keys = ("track", "observation")
+    optional_out_keys = ("observation",)
     in_sizes = {"field": (3,), "target_field": (3,), "heading": (1,), "elapsed_steps": (1,)}
 
     def __init__(
@@ -123,8 +124,9 @@ class TrackField(StatefulTransform):
         self._write(tensordict, advance(self.rules, State(*state), reading), reading)
 
     def _write(self, tensordict: TensorDictBase, track: Track, reading: Reading) -> None:
-        record, observed = _record(track, tensordict.batch_size), observation(self.rules, track, reading)
-        tensordict.set(self.out_keys[0], record).set(self.out_keys[1], observed)
+        tensordict.set(self.out_keys[0], _record(track, tensordict.batch_size))
+        for key in self.out_keys[1:]:
+            tensordict.set(key, observation(self.rules, track, reading))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the track and the observation."""
@@ -132,7 +134,8 @@ class TrackField(StatefulTransform):
         like = self._leaf(observation_spec, self.in_keys[0])
         leaves = _leaves(like.dtype)
         observation_spec[self.out_keys[0]] = _spec(leaves, observation_spec.shape, like.shape[:-1], like.device)
-        self._add(observation_spec, like, self.out_keys[1], OBSERVATION_SIZE)
+        for key in self.out_keys[1:]:
+            self._add(observation_spec, like, key, OBSERVATION_SIZE)
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
@@ -192,7 +195,8 @@ class DeclareArrival(ObservationTransform):
     """Declare arrival from the track of a :class:`TrackField` before it, so that a policy writes two numbers.
 
     For an environment whose action has a third number that declares the arrival
-    (:func:`magrl.tracking.declaring`).
+    (:func:`magrl.tracking.declaring`). It also writes the probability that the vehicle is within the radius,
+    ``arrival_probability`` ``(..., 1)``.
 
     Args:
         rules: of the track.
@@ -212,6 +216,8 @@ class DeclareArrival(ObservationTransform):
     """
 
     in_sizes = TrackField.in_sizes
+    default_out_keys = ("arrival_probability",)
+    out_sizes = {"arrival_probability": (1,)}
     invertible = True
 
     def __init__(self, rules: Rules, optional: Sequence[str] = (), in_keys: Keys | None = None) -> None:
@@ -220,8 +226,10 @@ class DeclareArrival(ObservationTransform):
         check_type(Rules, rules=rules)
         self.rules = rules
 
-    def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:  # noqa: ARG002
-        return []
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        posterior = DestinationPosterior(**next_tensordict["track", "posterior"])
+        probability = posterior.within(self.rules.radius_km).unsqueeze(-1)
+        return next_tensordict.set(self.out_keys[0], probability.to(next_tensordict[self.in_keys[0]].dtype))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(tensordict, [*self.in_keys, *self.in_keys_inv])

@@ -29,9 +29,8 @@ from magrl.evaluation.episodes import (
     stratified_bootstrap,
     wilson_interval,
 )
-from magrl.evaluation.navigators import fitted
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
-from magrl.navigators import Secant
+from magrl.navigators import Secant, policy_env
 from magrl.transforms import SensorErrors
 
 
@@ -90,23 +89,25 @@ def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
     assert all(torch.equal(named[key], given[key]) for key in named.keys())  # noqa: SIM118
     base = GeomagneticNavEnv(scenario, num_envs=3, seed=0, **options)
     env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0)))
+    policy = policy.fitted(base, {})
     with torch.no_grad():
-        own = env.rollout(4, fitted(policy, base), break_when_any_done=False, break_when_all_done=True)
+        own = policy_env(env, policy).rollout(4, policy, break_when_any_done=False, break_when_all_done=True)
     assert torch.equal(episode_measures(own)["length_km"], named["length_km"])
 
 
 def test_a_vehicle_without_a_finite_action_fails_alone() -> None:
     """The others fly as they do without it."""
 
-    def broken(tensordict: TensorDict) -> TensorDict:
-        hurt = (tensordict["elapsed_steps"] == 2) & (tensordict["target_position"] == target).all(-1, keepdim=True)
-        action = secant(tensordict)["action"]
-        return tensordict.set("action", torch.where(hurt, math.nan, action))
+    class Broken(Secant):
+        def forward(self, tensordict: TensorDict) -> TensorDict:
+            hurt = (tensordict["elapsed_steps"] == 2) & (tensordict["target_position"] == target).all(-1, keepdim=True)
+            action = super().forward(tensordict)["action"]
+            return tensordict.set("action", torch.where(hurt, math.nan, action))
 
     tasks = first_tasks(choose_tasks(None, "paper-100"), 6)
-    secant, target = Secant(), tasks.tasks.target[3]
+    target = tasks.tasks.target[3]
     with pytest.warns(UserWarning, match=r"not finite: vehicles \[3\] stopped"):
-        episodes = evaluate(broken, tasks)
+        episodes = evaluate(Broken(), tasks)
     sound, others = evaluate("secant", tasks), torch.arange(6) != 3
     assert not episodes["success"][3]
     for key in ("success", "length_km", "steps"):

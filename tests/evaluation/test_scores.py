@@ -43,12 +43,12 @@ class Predicting:
     def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False):
         assert deterministic
         assert episode_start.all() if state is None else not episode_start.any()
-        return toward(observation), (state or 0) + 1
+        return toward(observation), np.zeros((1, len(observation)))
 
 
-def with_state(observations: np.ndarray, state: int | None) -> tuple[np.ndarray, int]:
+def with_state(observations: np.ndarray, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Stands still until it has a state."""
-    return toward(observations) * (state is not None) - np.array([state is None, 0]), (state or 0) + 1
+    return toward(observations) * (state is not None) - np.array([state is None, 0]), np.ones(len(observations))
 
 
 BOX: dict[str, Any] = {"task": "box", "episodes": 8, "max_steps": 12}

@@ -1,8 +1,7 @@
-"""Navigators by a belief of the field: repeated calls, declarations, and files of pilots."""
+"""Navigators by a belief of the field: declarations, and files of pilots."""
 
 from __future__ import annotations
 
-import copy
 import math
 from pathlib import Path
 
@@ -10,14 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import step_mdp
 
 import magrl
 from magrl.envs import GeomagneticNavEnv
-from magrl.evaluation import evaluate, summarize
+from magrl.evaluation import evaluate, evaluation_rollout, summarize
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.files import load_tensors, save_tensors
-from magrl.navigators import Anywhere, Declaring, Kalman, Secant
+from magrl.navigators import Anywhere, Kalman, policy_env
 from magrl.tracking import Rules, correction_network
 from magrl.tracking.network import pretrained
 from magrl.transforms import SensorErrors
@@ -28,31 +26,11 @@ def env() -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=5, seed=3, start_heading="random")
 
 
-@pytest.mark.parametrize("make", [Anywhere, lambda: Declaring(Secant())], ids=["anywhere", "secant"])
-def test_a_second_call_on_a_state_changes_nothing(env, make) -> None:
-    """Also where episodes start at different steps, and after a batch of another size."""
-
-    def flown(calls: int) -> list[list[Tensor]]:
-        env.set_seed(3)
-        state, actions, policy = env.reset(), [], make()
-        policy(GeomagneticNavEnv(num_envs=2, seed=0).rollout(2)[:, -1])
-        for step in range(5):
-            actions.append([policy(state.clone())["action"] for _ in range(calls)])
-            state = step_mdp(env.step(state.set("action", actions[-1][0][..., :2])))
-            begin = torch.tensor([[True], [False], [False], [False], [False]])
-            state = env.reset(state.set("_reset", begin)) if step == 1 else state
-        return actions
-
-    for (once,), (first, second) in zip(flown(1), flown(2), strict=True):
-        assert torch.equal(first, once)
-        assert torch.equal(second, once)
-
-
 def test_an_untrained_correction_is_the_move_of_kalman() -> None:
     base = GeomagneticNavEnv(num_envs=10, seed=0, start_heading="random")
     env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0), bias=(0.1, 0.1, 10.0), seed=0))
     agents = Kalman(step_price=2.0), Anywhere(source=correction_network((8,)), step_price=2.0)
-    plain, corrected = (env.set_seed(0) and env.rollout(4, agent, auto_reset=True)["action"] for agent in agents)
+    plain, corrected = (env.set_seed(0) and policy_env(env, agent).rollout(4, agent)["action"] for agent in agents)
     torch.testing.assert_close(corrected, plain)
 
 
@@ -63,16 +41,17 @@ def test_every_navigator_declares(name: str) -> None:
     assert summary["spl"] > 80
 
 
-def test_moves_stay_within_adapted_limits() -> None:
+def test_moves_stay_within_the_limits_of_its_rules() -> None:
     env = GeomagneticNavEnv(num_envs=20, seed=0, start_heading="random")
-    action = env.rollout(2, Anywhere().adapted(max_move_km=10.0, max_turn_rad=0.5))["action"]
+    agent = Anywhere(max_move_km=10.0, max_turn_rad=0.5)
+    action = policy_env(env, agent).rollout(2, agent)["action"]
     assert 5 < action[..., 0].max() <= 10 + 1e-4
     assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4
 
 
 def test_actions_are_alike_by_any_default_type_of_floating_point_numbers() -> None:
     def actions() -> Tensor:
-        return GeomagneticNavEnv(num_envs=2, seed=0).rollout(3, Anywhere())["action"]
+        return evaluation_rollout(GeomagneticNavEnv(num_envs=2, seed=0, max_steps=3), Anywhere())["action"]
 
     expected = actions()
     torch.set_default_dtype(torch.float64)
@@ -92,8 +71,8 @@ def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
     magrl.save_policy(path, agent)
     loaded = magrl.load_policy(path)
     assert loaded.rules == agent.rules
-    state = env.rollout(3)[:, -1]
-    wanted, found = (copy.deepcopy(one)(state.clone())["action"] for one in (agent, loaded))
+    state = policy_env(env, agent).rollout(3)[:, -1]
+    wanted, found = (one(state.clone())["action"] for one in (agent, loaded))
     assert torch.equal(found, wanted)
 
 

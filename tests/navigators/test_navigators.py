@@ -1,24 +1,23 @@
 """Navigators that need no training, and all on another device."""
 
-import copy
 import itertools
 import math
 import sys
-from collections.abc import Callable
 
 import pytest
 import torch
 from support.conformance import check_one_device
 from support.tracks import randn
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs.utils import step_mdp
 
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
-from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant
+from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant, policy_env
 from magrl.navigators.base import displacement_to
 from magrl.navigators.metaheuristics import Metaheuristic
 from magrl.navigators.quasi_newton import probe_length
@@ -38,18 +37,6 @@ NOISE = (0.05, 0.05, 5.0)
 def flown(env: GeomagneticNavEnv, navigator) -> dict[str, float]:
     env.set_seed(0)  # back to each vehicle's first task
     return summarize(episode_measures(evaluation_rollout(env, navigator)))
-
-
-def noisy(navigator, noise: tuple[float, float, float]) -> Callable:
-    """The navigator with white noise on its readings, the true field put back for the environment."""
-    draw = torch.Generator().manual_seed(0)
-
-    def act(state: TensorDict) -> TensorDict:
-        error = torch.randn(state["field"].shape, generator=draw) * torch.tensor(noise)
-        action = navigator(state.clone().set("field", state["field"] + error))["action"]
-        return state.set("action", action)
-
-    return act
 
 
 def test_kalman_arrives_without_a_map() -> None:
@@ -104,13 +91,14 @@ def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
     truth = torch.tensor([[0.003, -0.002], [0.001, 0.017], [-1.0, 3.0]], dtype=torch.float64)
     start = torch.tensor([8.0, -16.0, 35000.0], dtype=torch.float64)
     legs = torch.tensor([[0.0, 0.0], [10.0, 0.0], [10.0 * math.cos(turn), 10.0 * math.sin(turn)]], dtype=torch.float64)
-    navigator, found = Secant(probe_km=10.0), []
+    navigator, found, memory = Secant(probe_km=10.0), [], TensorDict()
     for step, position in enumerate(legs.cumsum(0)):
         reading = start + truth @ position
         seen = {"field": reading, "target_field": start + 1, "heading": torch.tensor([turn * (step == 2)])}
         seen |= {"move": torch.tensor([10.0 * (step > 0), 0.0]), "elapsed_steps": torch.tensor([step])}
-        navigator(TensorDict(seen).unsqueeze(0))
-        found.append(navigator.memory["mean"][0, :, 1:].clone())
+        acted = navigator(TensorDict({**seen, "memory": memory}).unsqueeze(0).auto_batch_size_(1))
+        memory = acted["next", "memory"][0]
+        found.append(memory["mean"][:, 1:])
     size = torch.tensor([0.004, 0.015, 4.0], dtype=torch.float64)
     assert (found[0] == 0).all()
     across_only = torch.stack((truth[:, 0], torch.zeros(3, dtype=torch.float64)), -1)
@@ -126,7 +114,7 @@ def test_a_navigator_flies_about_the_shortest_path(env, name: str, spl: float, s
     assert summary["spl"] > spl
     assert summary["steps"] < steps
     assert navigator.oracle == (name == "parallel")
-    assert not navigator.field_readings.any()
+    assert not navigator.readings_per_step
 
 
 def test_parallel_and_secant_arrive_where_the_papers_pair_fails() -> None:
@@ -164,7 +152,7 @@ def test_mean_jacobian_needs_no_probes(env) -> None:
     assert summary["success_rate"] == 100
     assert summary["spl"] > 99.8
     assert summary["steps"] < 8.8
-    assert flown(env, noisy(navigator, NOISE))["spl"] > 96
+    assert flown(TransformedEnv(env, SensorErrors(NOISE), auto_unwrap=True), navigator)["spl"] > 96
 
 
 def test_each_navigator_declares_what_it_is() -> None:
@@ -182,69 +170,70 @@ def test_each_navigator_declares_what_it_is() -> None:
 def test_every_navigator_stays_in_bounds_and_reads_what_it_declares(name: str) -> None:
     """Bounds that are not the default; no key is optional."""
     env = GeomagneticNavEnv(num_envs=3, seed=4, max_move_km=8.0, max_turn_deg=math.degrees(0.7), start_heading="random")
-    navigator, other = (NAVIGATORS[name].for_env(env) for _ in range(2))
+    navigator = NAVIGATORS[name].for_env(env)
+    env = policy_env(env, navigator)
     state, longest = env.reset(), torch.zeros(())
     for _ in range(6):
-        action = navigator(state.clone())["action"]
-        if "seed" not in navigator.options:  # whose second call takes other random numbers
-            assert torch.equal(navigator(state.clone())["action"], action)
+        acted = navigator(state.clone())
+        action = acted["action"]
         assert ((action[:, 0] >= 0) & (action[:, 0] <= 8)).all()
         assert (action[:, 1].abs() <= 0.7 + 1e-6).all()
         longest = torch.maximum(longest, action[:, 0].max())
-        state = env.step(state.set("action", action))["next"]
+        state = step_mdp(env.step(acted))
     assert longest > 3.9
     for key in navigator.in_keys:
         with pytest.raises(KeyError):
-            other(state.exclude(key))
+            navigator(state.exclude(key))
 
 
 @pytest.mark.parametrize("name", ["secant", "kalman", "parallel"])
 def test_declination_continues_across_half_a_turn(env, name: str) -> None:
     """D from -180 to 180 gives the moves of D without that jump."""
 
-    def rotated(navigator, wrapped: bool) -> Callable:
-        def act(state: TensorDict) -> TensorDict:
-            seen = state.clone()
-            for key in ("field", "target_field"):
-                seen[key] = state[key].double()
-                seen[key][:, 0] += 179.9 - state["target_field"][:, 0].double()
-                if wrapped:
-                    seen[key][:, 0] -= 360 * (seen[key][:, 0] > 180)
-            return state.set("action", navigator(seen)["action"])
+    class Rotated(Transform):
+        """Add 171 degrees to D, which is 8 to 10 degrees there."""
 
-        return act
+        def __init__(self, wrapped: bool) -> None:
+            super().__init__(["field"], ["field"])
+            self.wrapped = wrapped
+
+        def _apply_transform(self, field: torch.Tensor) -> torch.Tensor:
+            turned = field.double() + torch.tensor([171.0, 0.0, 0.0]).double()
+            return turned - 360 * self.wrapped * (turned > 180) * torch.tensor([1, 0, 0])
+
+        def _reset(self, _: TensorDict, seen: TensorDict) -> TensorDict:
+            return self._call(seen.set("target_field", self._apply_transform(seen["target_field"])))
 
     moves = []
     for wrapped in (False, True):
-        few = GeomagneticNavEnv(env.scenario, num_envs=8, seed=0)
-        policy = rotated(make_navigator(name, few), wrapped)
-        moves.append(few.rollout(4, policy, break_when_any_done=False)["action"])
+        few = GeomagneticNavEnv(env.scenario, num_envs=8, seed=0, max_steps=4)
+        moves.append(evaluation_rollout(TransformedEnv(few, Rotated(wrapped)), make_navigator(name, few))["action"])
     torch.testing.assert_close(moves[0], moves[1], rtol=1e-3, atol=1e-3)
 
 
 def test_a_new_episode_begins_a_new_memory_for_its_vehicle_alone(env) -> None:
     navigator = Secant()
     env.set_seed(0)
-    state = env.reset()
-    for _ in range(4):
-        state = env.step(navigator(state))["next"]
+    state = policy_env(env, navigator).rollout(5, navigator)[:, -1]
     began = torch.arange(30) % 3 == 0
-    first = env.reset()
-    mixed = torch.where(began, first.select(*navigator.in_keys), state.select(*navigator.in_keys))
-    going = copy.deepcopy(navigator)(state.clone())["action"]
-    action = navigator(mixed)["action"]
-    torch.testing.assert_close(action[began], torch.tensor([0.5, 0.0]).expand(int(began.sum()), 2))
-    assert torch.equal(action[~began], going[~began])
-    assert (navigator.memory["mean"][began][..., 1:] == 0).all()
-    assert (navigator.memory["mean"][~began][..., 1:] != 0).all()
+    mixed = torch.where(began, env.reset().set("memory", state["memory"]), state.select(*env.reset().keys(), "memory"))
+    going, acted = navigator(state.clone()), navigator(mixed)
+    torch.testing.assert_close(acted["action"][began], torch.tensor([0.5, 0.0]).expand(int(began.sum()), 2))
+    assert torch.equal(acted["action"][~began], going["action"][~began])
+    slopes = acted["next", "memory", "mean"][..., 1:]
+    assert (slopes[began] == 0).all()
+    assert (slopes[~began] != 0).all()
 
 
 def test_secant_stands_a_field_without_change() -> None:
-    state, navigator = GeomagneticNavEnv(num_envs=2, seed=0).reset(), Secant()
+    navigator = Secant()
+    state = policy_env(GeomagneticNavEnv(num_envs=2, seed=0), navigator).reset()
     for step in range(5):
         state["elapsed_steps"] = torch.full((2, 1), step)
         state["move"] = torch.tensor([[10.0, 0.0]]).expand(2, 2) * (step > 0)
-        assert torch.isfinite(navigator(state)["action"]).all()
+        acted = navigator(state)
+        assert torch.isfinite(acted["action"]).all()
+        state["memory"] = acted["next", "memory"]
 
 
 def test_bad_options_are_refused_with_their_value(env) -> None:
@@ -266,21 +255,20 @@ def test_bad_options_are_refused_with_their_value(env) -> None:
 def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
     """A navigator that is told nothing flies by what comes with the readings."""
     bias = (0.5, 0.1, 20.0)
-    env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random")
+    env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random", max_steps=6)
     own = Conditions("own", sensors={"noise": (0.02, 0.02, 2.0), "bias": bias})
-    flights = []
-    for told in (Secant(sensor_std=own.std.noise), Secant(sensor_std=own.std)):
-        env.set_seed(0)
-        flights.append(with_conditions(env, own).rollout(6, told, break_when_any_done=False)["next", "position"])
-    assert torch.equal(*flights)
+    told, full = (
+        evaluation_rollout(with_conditions(env, own), Secant(sensor_std=std))["next", "position"]
+        for std in (own.std.noise, own.std)
+    )
+    assert torch.equal(told, full)
 
 
 def test_a_reading_that_is_nan_is_not_flown(env) -> None:
     """A NaN action, which the environment refuses, and not a move by a guess; other vehicles go on."""
     env.set_seed(0)
-    navigator, state = Secant(), env.reset()
-    for _ in range(3):
-        state = env.step(navigator(state))["next"]
+    navigator = Secant()
+    state = policy_env(env, navigator).rollout(4, navigator)[:, -1]
     state["field"][3] = torch.nan
     action = navigator(state)["action"]
     assert action[3, 1].isnan()
@@ -289,7 +277,6 @@ def test_a_reading_that_is_nan_is_not_flown(env) -> None:
 
 @pytest.mark.parametrize("name", sorted({*NAVIGATORS} - {"kalman"}))  # which is in anywhere
 def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch) -> None:
-    """In a decision, without the choice of rows in a batch, whose number depends on values."""
     monkeypatch.setattr(sys.modules["magrl.tracking.destination"], "_STEPS", 1)
     arrival = "declared" if name in ("anywhere", "dead_reckoning") else "objective"
     env = GeomagneticNavEnv(num_envs=2, seed=0, arrival=arrival)
@@ -297,27 +284,6 @@ def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch)
     navigator = NAVIGATORS[name].for_env(env)
     if name == "dead_reckoning":
         navigator = navigator.fitted(env, {"model": earth_model("IGRF-13", "2022-01-01")})
-    seen = env.reset().update({key: torch.zeros(2, 3) for key in STD_KEYS})
-    seen = seen.select(*navigator.in_keys, *navigator.optional_keys, strict=False)
-
-    def decide(moved) -> None:
-        there = moved(seen)
-        step = there["elapsed_steps"].squeeze(-1)
-        memory = {"decided_at": step, "field_readings": step, "action": there["heading"]}
-        navigator.decide(there, TensorDict(memory | navigator.first_memory(there), 2))
-
-    check_one_device(monkeypatch, navigator, decide)
-
-
-@pytest.mark.parametrize("name", ["secant", "kalman", "memory", "geodesic"])
-def test_a_navigator_never_gives_the_actions_of_other_vehicles(name: str) -> None:
-    """One with a memory refuses a second environment; another one decides anew."""
-    one, other = (GeomagneticNavEnv(num_envs=4, seed=seed).rollout(2) for seed in (1, 2))
-    shared, own = (make_navigator(name, GeomagneticNavEnv(num_envs=4, seed=0)) for _ in range(2))
-    shared(one[:, 0].clone())
-    shared(one[:, 1].clone())
-    if name != "geodesic":
-        with pytest.raises(RuntimeError, match="remembers other vehicles"):
-            shared(other[:, 1].clone())
-    else:
-        assert torch.equal(shared(other[:, 1].clone())["action"], own(other[:, 1].clone())["action"])
+    seen = policy_env(env, navigator).reset().update({key: torch.zeros(2, 3) for key in STD_KEYS})
+    act = getattr(navigator, "_best", navigator)  # without the choice of rows, whose number depends on values
+    check_one_device(monkeypatch, navigator, lambda moved: act(moved(seen)))

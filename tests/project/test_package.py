@@ -42,7 +42,7 @@ assert version("magrl") == magrl.__version__, (version("magrl"), magrl.__version
 assert all(getattr(magrl, name) is not None for name in magrl.__all__)
 
 env = magrl.GeomagneticNavEnv(num_envs=4, seed=0)
-rollout = env.rollout(12, navigators.Secant(), break_when_any_done=False)
+rollout = magrl.evaluation_rollout(env, navigators.Secant())
 print(magrl.summarize(magrl.episode_measures(rollout))["success_rate"])
 maps.trajectories_figure(rollout, env.field, env.region).savefig("episodes.png")
 """

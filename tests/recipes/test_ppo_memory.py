@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs.utils import check_env_specs
 
 from magrl import load_policy, planet_scenario, save_policy
+from magrl.navigators import policy_env
 from magrl.navigators.memory import Memory, MemoryNetwork
 from magrl.tracking.network import pretrained
 from magrl.transforms.sequences import READING_SIZE
@@ -46,7 +47,7 @@ def test_an_agent_acts_as_it_was_trained() -> None:
     env = training_env()
     moves = env.rollout(4, TensorDictSequential(recipe.make_memory(trained), mean, leg), break_when_any_done=False)
     plain = recipe.task_env(env.base_env.scenario, CONFIG, num_envs=6, seed=5, observation="dict", scale_actions=False)
-    flown = plain.rollout(4, Memory(trained), break_when_any_done=False)
+    flown = policy_env(plain, Memory(trained)).rollout(4, Memory(trained), break_when_any_done=False)
     assert moves["action"].std() > 0.1
     torch.testing.assert_close(flown["next", "field"], moves["next", "field"], rtol=1e-4, atol=1e-2)
     torch.testing.assert_close(flown["next", "move"], moves["next", "move"], rtol=1e-4, atol=1e-2)

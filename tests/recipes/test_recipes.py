@@ -105,7 +105,6 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
     env = no_go_env(8, observation="dict", scale_actions=False, seed=1, max_steps=8)
     seen = next(state for state in evaluation_rollout(env, policy).unbind(1) if state["areas"].any())
     blind = seen.select(*policy.in_keys).set("areas", torch.zeros_like(seen["areas"]))
-    policy.memory = None
     assert not torch.equal(policy(blind)["action"], seen["action"])
     flat, dicts = no_go_env(8, seed=1), no_go_env(8, observation="dict", seed=1)
     assert policy.view == flat.view

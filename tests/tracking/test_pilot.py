@@ -10,7 +10,6 @@ from support.readings import first_reading, moved
 from support.tracks import STD, f64
 from tensordict import TensorDict
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from magrl.sensor_std import SensorStd
 from magrl.tracking import (
@@ -25,7 +24,6 @@ from magrl.tracking import (
     advance,
     arrival_ellipse,
     begin,
-    blank,
     declaring,
     earth_model,
     pilot,
@@ -34,7 +32,6 @@ from magrl.tracking import (
     unvisited_yet,
     visit,
 )
-from magrl.tracking.pilot import step
 from magrl.transforms.track import reading_of
 
 ERRORS = SensorStd(STD, (0.5, 0.3, 60.0), (0.3, 0.2, 30.0), (20.0, 20.0, 20.0))
@@ -56,31 +53,15 @@ def readings() -> tuple[Reading, Reading]:
 
 @pytest.mark.slow
 def test_a_step_traces_as_one_graph(readings) -> None:
-    """The first reading, a later one, and the declaration."""
+    """A later reading, and the declaration."""
     rules = RULES.replace(arrival="declared")
 
     def decided(state: State, reading: Reading) -> Tensor:
-        return act(rules, step(rules, state, reading), reading)[0]
+        track = advance(rules, state, reading)
+        return declaring(rules, track, reading, act(rules, track, reading))[0]
 
     given = begin(rules, readings[0]).state, readings[1]
     torch.testing.assert_close(torch.compile(decided, fullgraph=True, backend="eager")(*given), decided(*given))
-
-
-def test_vehicles_that_begin_do_not_touch_those_that_go_on(readings) -> None:
-    started = begin(RULES, readings[0])
-    went = advance(RULES, started.state, readings[1])
-    fresh = torch.tensor([True, False, False, True])
-
-    def mixed(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(fresh.reshape(4, *[1] * (new.ndim - 1)), new, old)
-
-    std = SensorStd(*map(mixed, readings[0].std, readings[1].std))
-    both = Reading(*map(mixed, readings[0][:4], readings[1][:4]), std, mixed(readings[0].step, readings[1].step))
-    track = step(RULES, started.state, both)
-    for found, new, old in zip(*map(tree_leaves, (track, started, went)), strict=True):
-        torch.testing.assert_close(found, mixed(new, old), rtol=0, atol=0, equal_nan=True)
-    assert [part.shape for part in blank(readings[0])] == [part.shape for part in track.state]
-    assert [part.dtype for part in blank(readings[0])][:6] == [part.dtype for part in track.state][:6]
 
 
 def test_the_first_reading_counts_with_twice_its_noise(readings) -> None:

@@ -11,7 +11,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, planet_scenario
-from magrl.evaluation import episode_measures
+from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.field.elements import elements_gradient
 from magrl.field.model import elements_at
 from magrl.geodesy import geodesic, move
@@ -77,7 +77,7 @@ def test_returns_depend_on_both_ends_alone() -> None:
     rollouts = []
     for rewards in ((TrueWay(), ProgressReward()), (RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())):
         env = TransformedEnv(nav(64, max_steps=10), Compose(*rewards))
-        rollouts.append(env.rollout(10, Secant(), break_when_any_done=False, break_when_all_done=True))
+        rollouts.append(evaluation_rollout(env, Secant()))
     measures = episode_measures(rollouts[0])
     within = torch.arange(rollouts[0].shape[1]) < measures["steps"].unsqueeze(-1)
     nearer_km, price = measures["shortest_km"] - measures["navigation_error_km"], rollouts[1]["step_price"][:, 0, 0]

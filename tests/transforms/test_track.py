@@ -18,8 +18,8 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
-from magrl.navigators import Declaring, Secant
-from magrl.tracking import Rules, Track, advance, begin, observation
+from magrl.navigators import Secant, policy_env
+from magrl.tracking import Rules, Track, advance, begin, declaring, observation
 from magrl.transforms import DeclareArrival, KnownPlace, SensorErrors, TrackField
 from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, known_keys, reading_of, track_of
 
@@ -93,17 +93,18 @@ def test_without_noise_it_finds_gradient_and_destination() -> None:
 # Declarations
 
 
-def test_the_transform_declares_as_the_navigator() -> None:
-    options = {"arrival": "declared", "max_steps": 8, "distance_range_km": (60, 150)}
-    base = GeomagneticNavEnv(num_envs=4, seed=0, **options)
-    plain = TransformedEnv(base, SensorErrors(STD, bias=BIAS, seed=3))
-    rules = RULES.replace(arrival="declared", max_steps=8)
-    wanted = evaluation_rollout(plain, Declaring(Secant(), rules))
-    env = tracked(4, SensorErrors(STD, bias=BIAS, seed=3), rules=rules, **options)
-    env.append_transform(DeclareArrival(rules, known_keys(env.observation_spec)))
-    found = evaluation_rollout(env, Secant())
-    assert torch.equal(found["next", "position"], wanted["next", "position"])
-    assert torch.equal(found["next", "declared"], wanted["next", "declared"])
+def test_the_declaration_is_that_of_the_pure_function() -> None:
+    """With the legs of a navigator that does not declare; the environment adds track and declaration by itself."""
+    base = GeomagneticNavEnv(num_envs=4, seed=0, arrival="declared", max_steps=8, distance_range_km=(60, 150))
+    env = TransformedEnv(base, SensorErrors(STD, bias=BIAS, seed=3))
+    rules, found = Rules(**base.limits), policy_env(env, Secant()).rollout(8, Secant())
+    again = evaluation_rollout(env, Secant())[:, : found.shape[1]]
+    assert torch.equal(found["next", "position"], again["next", "position"])
+    for row in found.unbind(1):
+        action, decision = declaring(rules, track_of(row["track"]), reading_of(row), row["action"])
+        torch.testing.assert_close(row["arrival_probability"].squeeze(-1), decision.probability.float())
+        torch.testing.assert_close(row["next", "move"], action[:, :2])
+        assert torch.equal(row["next", "declared"].squeeze(-1), action[:, 2] > 0)
     assert found["next", "declared"].any()
 
 
@@ -114,8 +115,8 @@ def test_declarations_are_as_often_right_as_they_say_and_confidence_prevents_fal
     for confidence in (0.0, 0.8):
         base = paper_env(60, arrival="declared", max_steps=20)
         env = TransformedEnv(base, SensorErrors(STD, bias=SMALL_BIAS, seed=1))
-        navigator = Declaring(Secant(sensor_std=STD), **base.limits, confidence=confidence)
-        rollout = evaluation_rollout(env, navigator)
+        navigator = Secant(sensor_std=STD)
+        rollout = evaluation_rollout(policy_env(env, navigator, confidence=confidence), navigator)
         said = rollout["next", "declared"].squeeze(-1) & ~rollout["declared"].squeeze(-1)
         probability, right = rollout["arrival_probability"][said], rollout["next", "success"][said]
         assert probability.min() >= confidence

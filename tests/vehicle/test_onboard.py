@@ -21,14 +21,15 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, ObservationNorm, TransformedEnv
+from torchrl.envs.utils import step_mdp
 
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.episodes import restart
-from magrl.evaluation.navigators import fitted, make_navigator
+from magrl.evaluation.navigators import make_navigator
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move, move_place
-from magrl.navigators import Anywhere, Navigator
+from magrl.navigators import Anywhere, Navigator, policy_env
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Rules, load_pilot, save_pilot
 from magrl.tracking.network import pretrained
@@ -49,7 +50,7 @@ def nav() -> GeomagneticNavEnv:
 
 
 def navigator(name: str, env: GeomagneticNavEnv, sensor_std: SensorStd | Triple = NONE) -> Navigator:
-    return fitted(make_navigator(name, env, sensor_std=sensor_std), env, confidence=0.0)
+    return make_navigator(name, env, sensor_std=sensor_std).fitted(env, {"confidence": 0.0})
 
 
 def numbers(state: TensorDictBase) -> tuple[float, ...]:
@@ -72,26 +73,27 @@ def at(latitude: float, longitude: float, date: str = "2026-06-30") -> list[floa
 def fly(env: EnvBase, policy: Navigator, vehicle: Onboard, limit: int = 99, none: int = 0) -> Iterator[tuple]:
     """Fly one vehicle in the environment and beside it the one on board, and yield commands and states."""
     restart(env)
+    env = policy_env(env, policy, confidence=0.0)
     state = env.reset()
     for _ in range(limit):
         reading = numbers(state)
         missing = state.get("sensor_std", torch.zeros(1)).max().item() > 100
         command = vehicle.step(*[None] * (3 if missing else none), *reading[3 if missing else none :])
         with torch.no_grad():
-            after = env.step(policy(state))["next"]
-        yield command, state, after
-        if after["done"].item():
+            acted = env.step(policy(state.clone()))
+        yield command, state, acted["next"]
+        if acted["next", "done"].item():
             return
-        state = after
+        state = step_mdp(acted)
 
 
-def check(command: Command, policy: Navigator, after: TensorDictBase) -> None:
+def check(command: Command, state: TensorDictBase, after: TensorDictBase) -> None:
     """The command is the action of the environment, and the probability that of its navigator."""
     distance, turn = after["move"][0].tolist()
     assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
     off = command.heading_deg - math.degrees(after["heading"].item())
     assert math.remainder(off, 360) == pytest.approx(0, abs=0.05)
-    assert command.confidence == pytest.approx(policy.memory["arrival_probability"].item(), abs=1e-4)
+    assert command.confidence == pytest.approx(state["arrival_probability"].item(), abs=1e-4)
     assert (command.stop == "arrived") == after["declared"].item()
 
 
@@ -123,7 +125,7 @@ def test_commands_are_those_of_the_environment(
     vehicle.start((None, *target[1:]) if magnetic else target)
     outages = []
     for command, state, after in fly(env, policy, vehicle, 99 if name == "kalman" else 6, none=int(magnetic)):
-        check(command, policy, after)
+        check(command, state, after)
         outages.append(state["sensor_std"].max().item() > 100)
     assert len(outages) > 5
     assert after["declared"].item() == (name == "kalman")
@@ -169,7 +171,7 @@ def test_commands_of_own_policies() -> None:
     base, policy = nav(), region_policy()
     vehicle = begun(policy, base.reset()["target_field"][0].tolist(), max_move_km=200.0)
     assert vehicle.options.max_move_km == pytest.approx(50.0)
-    for command, state, _ in fly(base, fitted(policy, base), vehicle, 6):
+    for command, state, _ in fly(base, policy, vehicle, 6):
         action = policy(state.clone())["action"][0].tolist()
         assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx(action, abs=1e-5)
     with pytest.raises(ValueError, match=r"the target: D -11\.6 deg is out of the range of the navigator"):

@@ -15,6 +15,7 @@ from magrl.envs import PUBLIC_KEYS
 from magrl.field.elements import NAMES, element_difference
 from magrl.geodesy import wrap_angle
 from magrl.navigators import Memory, Secant
+from magrl.navigators.base import MEMORY
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import Reading
 from magrl.vehicle.onboard.journal import Options
@@ -69,6 +70,7 @@ class Other:
             raise ValueError(f"unknown navigator {navigator!r}: choose {names}")
         self.navigator: Any = Secant() if isinstance(navigator, str) else copy.deepcopy(navigator).cpu()
         self.error, self.left, self.course = torch.zeros(3), SensorStd(), torch.zeros(())
+        self.memory = TensorDict({}, [1])
         self._secant, self.name = isinstance(navigator, str), type(self.navigator).__name__
         keys: Any = self.navigator.in_keys
         if unknown := sorted({*map(str, keys)} - READS):
@@ -97,4 +99,6 @@ class Other:
         rows |= dict(zip(STD_KEYS, reading.std._replace(bias=self.left.bias), strict=True))
         seen = {key: row.float().unsqueeze(0) for key, row in rows.items()}
         seen |= {"elapsed_steps": reading.step.reshape(1, 1), "done": torch.zeros(1, 1, dtype=torch.bool)}
-        return self.navigator(TensorDict(seen, [1]))["action"][0, :2]
+        acted = self.navigator(TensorDict({**seen, MEMORY: self.memory}, [1]))
+        self.memory = acted.get(("next", MEMORY), self.memory)
+        return acted["action"][0, :2]

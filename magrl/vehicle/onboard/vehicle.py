@@ -255,10 +255,10 @@ class Onboard:
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
         """Return the action of the navigator, with its declaration, and the decision behind that."""
         if self._other is None:
-            action, decision = tracking.act(self._rules, track, reading, self._network)
-            assert decision is not None
-            return action, decision
-        return tracking.declaring(self._rules, track, reading, self._other.move(reading))
+            action = tracking.act(self._rules, track, reading, self._network)
+        else:
+            action = self._other.move(reading)
+        return tracking.declaring(self._rules, track, reading, action)
 
     def _comparable(self, elements: Any) -> Any:
         """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""

@@ -1,6 +1,5 @@
 """Conditions of real vehicles: presets, what navigators are told, what they may read, and the commands."""
 
-import copy
 import math
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import torch
 import tyro
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs.utils import step_mdp
 
 from magrl import Anywhere, Kalman
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
@@ -18,7 +18,7 @@ from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
-from magrl.navigators import Secant
+from magrl.navigators import Secant, policy_env
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
 from magrl.transforms import (
     CONDITIONS,
@@ -27,6 +27,7 @@ from magrl.transforms import (
     MotionError,
     NorthReferenceError,
     SensorErrors,
+    TrackField,
     VectorErrors,
     conditions_named,
     load_conditions,
@@ -148,12 +149,18 @@ def test_navigators_are_told_what_they_can_tell_apart() -> None:
 def test_agents_heed_all_errors_that_are_stated(kind: type[Kalman]) -> None:
     """Each kind changes the move; without a statement, readings are perfect."""
     state, policy, told = nav(4).reset(), kind(), {}
-    without = policy(state.clone())["action"]
-    assert torch.equal(policy(state.clone().update(dict.fromkeys(STD_KEYS, 0 * state["field"])))["action"], without)
-    actions = [without]
+
+    def action() -> torch.Tensor:
+        seen = TrackField(policy.rules, [*told])(state.clone().update(told))
+        return policy(seen)["action"]
+
+    actions = [action()]
+    told = dict.fromkeys(STD_KEYS, 0 * state["field"])
+    assert torch.equal(action(), actions[0])
+    told = {}
     for key, std in zip(STD_KEYS, ((0.3, 0.3, 30.0), (3.0, 0.5, 90.0), (2.0, 0.4, 60.0), (40.0,) * 3), strict=True):
         told[key] = torch.tensor(std).expand(4, 3)
-        actions.append(policy(state.clone().update(told))["action"])
+        actions.append(action())
         assert not torch.allclose(actions[-1], actions[-2]), key
 
 
@@ -183,7 +190,8 @@ def test_own_errors_in_a_file() -> None:
     }
     boat = Conditions("survey boat", 15.0, **options)
     assert (load_conditions(BOAT).name, load_conditions(BOAT).std) == (boat.name, boat.std)
-    flown = [with_conditions(nav(2, 8.0), each, 3).rollout(2, Secant()) for each in (str(BOAT), boat)]
+    envs = [with_conditions(nav(2, 8.0, max_steps=2), each, 3) for each in (str(BOAT), boat)]
+    flown = [evaluation_rollout(env, Secant()) for env in envs]
     torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
         assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).errors == str(BOAT)
@@ -225,12 +233,16 @@ def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> Non
     noise = (0.05, 0.05, 5.0)
     env = with_conditions(nav(10), Conditions("noise", sensors={"noise": noise}), seed=0)
     navigator = make_navigator(name, env.base_env, sensor_std=noise)
-    state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
+    env = policy_env(env, navigator)
+    step = env.rollout(4, navigator, break_when_any_done=False)[:, -1]
 
     def turns(std: float, shift: float) -> torch.Tensor:
         """Turns [rad] after a reading with ``std`` times the noise that is shifted by ``shift`` times the noise."""
-        field, told = state["field"] + shift * torch.tensor(noise), (std * torch.tensor(noise)).expand(10, 3)
-        return copy.deepcopy(navigator)(state.clone().update({"field": field, "sensor_std": told}))["action"][:, 1]
+        told = (std * torch.tensor(noise)).expand(10, 3)
+        read = step.clone()
+        read["next", "field"], read["next", "sensor_std"] = step["next", "field"] + shift * torch.tensor(noise), told
+        read = env.transform[-1](read) if name == "kalman" else read
+        return navigator(step_mdp(read))["action"][:, 1]
 
     heeded, ignored = ((turns(std, 5.0) - turns(std, 0.0)).abs().mean() for std in (1.0, OUTAGE_STD))
     assert heeded > 0.01

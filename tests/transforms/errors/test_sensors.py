@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from magrl.field.elements import field_vector
-from magrl.navigators import Secant
+from magrl.navigators import Secant, policy_env
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
 from magrl.transforms import SensorErrors, Spikes, VectorErrors, sensor_levels
 from magrl.transforms.errors.sensors import DRIFT_KM
@@ -167,8 +167,7 @@ def test_noise_is_white_and_normal() -> None:
 
 
 def test_without_noise_the_reading_is_the_value_to_the_bit() -> None:
-    td = under(SensorErrors()).rollout(3, Secant())
-    expected = nav().rollout(3, Secant())
+    td, expected = (policy_env(env, Secant()).rollout(3, Secant()) for env in (under(SensorErrors()), nav()))
     assert torch.equal(td["next", "field"], expected["next", "field"])
     assert torch.equal(td["action"], expected["action"])
 

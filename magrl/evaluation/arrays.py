@@ -1,0 +1,100 @@
+"""Functions of arrays as policies, whose state is in the TensorDict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.utils._pytree import tree_flatten, tree_unflatten
+from torchrl.envs import EnvBase, Transform
+
+from magrl.checks import short
+from magrl.navigators import Navigator
+from magrl.navigators.base import MEMORY, memory_primer
+
+Act = Callable[[NDArray[np.float32], Any, NDArray[np.bool_]], tuple[Any, Any]]
+"""From observations, state, and whether episodes start, to actions and the next state."""
+
+
+class ArrayPolicy(Navigator):
+    """A function of arrays as a policy, which gets the observation and the state that it returned before.
+
+    Args:
+        act: function; its state is None at the start of an episode.
+
+    Example:
+        >>> from magrl.envs.navigation import navigation_env
+        >>> from magrl.navigators import policy_env
+        >>> def act(observations, state, first):
+        ...     steps = np.zeros((len(observations), 1)) if state is None else state
+        ...     return np.concatenate((steps / 10, 0 * steps), 1), steps + 1
+        >>> env, policy = navigation_env(2, seed=0), ArrayPolicy(act)
+        >>> policy_env(env, policy).rollout(3, policy)["action"][0, :, 0]
+        tensor([0.0000, 0.1000, 0.2000])
+    """
+
+    in_keys: ClassVar[list[str]] = ["observation", "elapsed_steps"]
+
+    def __init__(self, act: Act) -> None:
+        super().__init__()
+        self.act = act
+        self._form: tuple[list[tuple[bool, int]], Any] = [], None  # of a state: kinds and axes of its arrays, and tree
+
+    def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:  # noqa: ARG002
+        """Return the memory of its state, if it has one, in the form of that after a first step of zeros."""
+        observed = env.observation_spec.zero()
+        _, state = self._called(observed["observation"], None)
+        return [memory_primer(state, env)] if state and MEMORY not in observed else []
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action and the next state; vehicles that start an episode are a batch of their own."""
+        first = tensordict["elapsed_steps"].squeeze(-1) == 0
+        rows = [mask.nonzero().squeeze(-1) for mask in (first, ~first) if mask.any()]
+        parts = torch.cat([self._acted(tensordict[part], first=bool(first[part[0]])) for part in rows])
+        return tensordict.update(parts[torch.cat(rows).argsort()])
+
+    def _acted(self, tensordict: TensorDictBase, *, first: bool) -> TensorDict:
+        """Return the actions and the next state of vehicles that all start an episode, or all go on."""
+        memory = None if first else tensordict.get(MEMORY, None)
+        action, state = self._called(tensordict["observation"], memory)
+        return TensorDict({"action": action, **({"next": {MEMORY: state}} if state else {})}, [len(action)])
+
+    def _called(self, seen: Tensor, memory: TensorDictBase | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return actions ``(N, A)`` and the arrays ``(N, ...)`` of the next state by their number."""
+        count = len(seen)
+        given = None if memory is None else self._state(memory)
+        actions, state = self.act(np.array(seen.cpu().numpy()), given, np.full(count, memory is None))
+        arrays, tree = ([], None) if state is None else tree_flatten(state)
+        axes = [_axis_of(array, count) for array in arrays]
+        self._form = [(isinstance(array, Tensor), axis) for array, axis in zip(arrays, axes, strict=True)], tree
+        rows = [torch.as_tensor(array).movedim(axis, 0) for array, axis in zip(arrays, axes, strict=True)]
+        return _checked(actions, count).to(seen.device), {str(number): row for number, row in enumerate(rows)}
+
+    def _state(self, memory: TensorDictBase) -> Any:
+        """Return a state in the form that the function returned it."""
+        kinds, tree = self._form
+        arrays = [memory[str(number)].movedim(0, axis) for number, (_, axis) in enumerate(kinds)]
+        return tree_unflatten([a if tensor else a.numpy() for a, (tensor, _) in zip(arrays, kinds, strict=True)], tree)
+
+
+def _checked(actions: Any, count: int) -> Tensor:
+    """Return actions as float32; raise unless they are finite numbers ``(count, 2)`` or ``(count, 3)``."""
+    array = np.asarray(actions)
+    if array.shape not in [(count, 2), (count, 3)] or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        wanted = f"finite numbers of shape ({count}, 2), a vehicle per row"
+        raise ValueError(f"actions must be {wanted}, got {array.dtype} {array.shape}: {short(array.tolist())}")
+    return torch.from_numpy(array.astype(np.float32))
+
+
+def _axis_of(array: Any, count: int) -> int:
+    """Return the axis of the vehicles of an array in a state, the first or the second one."""
+    shape = tuple(getattr(array, "shape", ()))
+    if count not in shape[:2]:
+        wanted = f"arrays with {count} vehicles on their first or second axis"
+        raise ValueError(f"a state must be None or hold {wanted}, got {short(array)}")
+    return shape.index(count)
