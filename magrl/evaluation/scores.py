@@ -20,7 +20,7 @@ from torchrl.envs import InitTracker, TransformedEnv
 from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_choice, short
-from magrl.envs.navigation import NAMED_ENVS
+from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
 from magrl.evaluation.navigators import OWN, fitted, make_navigator, parse_navigator, policy_file
 from magrl.navigators import NAVIGATORS
@@ -49,11 +49,11 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
             - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
               ``act(observations, state)`` returns actions and the next state, which is None at the start. It gets no
               other key.
-        task: name in :data:`magrl.envs.navigation.NAMED_ENVS`: ``"box"``, ``"anywhere"``, ``"readings"``, ``"storm"``,
-            ``"nogo"``.
+        task: name or id of a task in :data:`magrl.registry.NAMED_TASKS`: ``"nogo"``, or
+            ``"magrl/GeomagneticNavigationNoGo-v0"``.
         episodes: vehicles, each with one episode.
         seed: seed of the episodes; the default is reserved for evaluations.
-        options: of the function there. The score is then not the task's.
+        options: of its function in :mod:`magrl.envs.navigation`. The score is then not the task's.
 
     Returns:
         ``SR``, success rate [%]; ``SPL`` [%] with its bootstrap 95 % interval over episodes, ``SPL_low`` and
@@ -70,7 +70,7 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
         >>> [score(agent, "box", episodes=8)["SR"] for agent in ("secant", straight)]
         [100.0, 0.0]
     """
-    return scored(flown(agent, task, episodes=episodes, seed=seed, **options))
+    return scored(flown(agent, task_name(task), episodes=episodes, seed=seed, **options))
 
 
 def flown(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> TensorDict:

@@ -21,6 +21,7 @@ from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.navigation import NAMED_ENVS, navigation_env
 from magrl.evaluation.scores import SEED, scored
 from magrl.navigators import Secant
+from magrl.registry import NAMED_TASKS
 
 
 class Toward(nn.Module):
@@ -78,6 +79,14 @@ def test_all_kinds_of_an_agent_have_the_same_score(wanted: dict[str, float], tmp
 
 def test_a_navigator_has_the_score_of_its_name() -> None:
     assert score("secant", "nogo", episodes=4) == score(Secant(), "nogo", episodes=4)
+
+
+def test_a_task_is_given_by_its_name_or_its_id() -> None:
+    name, scores = NAMED_TASKS["nogo"].id, score("secant", "nogo", episodes=2, max_steps=2)
+    assert score("secant", name, episodes=2, max_steps=2) == pytest.approx(scores, nan_ok=True)
+    assert GeomagneticNavVectorEnv(2, task=name).single_observation_space.shape == (22,)
+    with pytest.raises(ValueError, match=r"task must be one of 'box', .*, got 'magrl/GeomagneticNavigationNoGo-v9'"):
+        score("secant", name.replace("v0", "v9"))
 
 
 def test_the_episodes_are_those_of_the_seed_in_gymnasium(wanted: dict[str, float]) -> None:

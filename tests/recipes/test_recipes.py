@@ -32,6 +32,12 @@ def names(module) -> str:
     return module.__name__
 
 
+def few_steps(monkeypatch, max_steps: int) -> None:
+    """Give *NoGo* another deadline."""
+    row = recipe.NAMED_TASKS["nogo"]
+    monkeypatch.setitem(recipe.NAMED_TASKS, "nogo", row._replace(options={"max_steps": max_steps}))
+
+
 def test_the_return_is_the_sum_of_its_terms() -> None:
     base = GeomagneticNavEnv(num_envs=2, seed=0)
     after = recipe.make_env(base, base.observation_view(), recipe.Config()).rollout(4)["next"]
@@ -95,7 +101,7 @@ def test_a_task_takes_its_preset_unless_another_is_given() -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatch) -> None:
     """Its policy sees areas in training and evaluation, and flies where there are some."""
-    monkeypatch.setattr(recipe, "NO_GO_STEPS", 4)
+    few_steps(monkeypatch, 4)
     recipe.train(small(recipe, tmp_path / "run", task="nogo", total_frames=64, eval_every=4))
     assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
     rows, _ = outcome(tmp_path / "run")
@@ -133,7 +139,7 @@ def test_options_reach_the_training(tmp_path: Path, outcome) -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys, monkeypatch) -> None:
     """The first episodes end before the replay buffer holds a batch; progress is shown in episodes."""
-    monkeypatch.setattr(recipe, "NO_GO_STEPS", 10)
+    few_steps(monkeypatch, 10)
     options = {"total_episodes": 1, "total_frames": 88, "batch_size": 85, "num_envs": 4, "zeta": 1e-12}
     result = recipe.train(small(recipe, tmp_path, task="nogo", **options))
     text = capsys.readouterr()
