@@ -22,8 +22,7 @@ from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_choice, short
 from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
-from magrl.evaluation.navigators import OWN, fitted, make_navigator, parse_navigator, policy_file
-from magrl.navigators import NAVIGATORS
+from magrl.evaluation.navigators import fitted, make_navigator, named
 
 SEED = paper.FIRST_RESERVED_SEED + 69
 """Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
@@ -127,10 +126,8 @@ def _takes_state(act: Callable[..., Any]) -> bool:
 
 def _of_text(text: str) -> TensorDictModuleBase | str:
     """Return the network of an ONNX file without a view as a policy; otherwise the text of a navigator."""
-    text = f"{OWN}={text}" if text not in NAVIGATORS and Path(text).is_dir() else text
-    source = parse_navigator(text).source
-    path = policy_file(source) if source else Path()
-    if path.suffix != ".onnx" or not path.is_file() or has_view(content := path.read_bytes()):
+    path = named(text).file
+    if path is None or path.suffix != ".onnx" or has_view(content := path.read_bytes()):
         return text
 
     def act(seen: NDArray[np.float32], state: Any, _: object) -> tuple[Any, Any]:
