@@ -22,7 +22,7 @@ from magrl.envs.navigation import guidance_pair, task_transforms
 from magrl.envs.specs import REWARD_TERMS
 from magrl.registry import NAMED_TASKS
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
+from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig
 from magrl.training.run import make_collector
 from magrl.transforms import (
     AlignmentReward,
@@ -50,7 +50,7 @@ LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_
 ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
-class Config(RunConfig):
+class Config(RegionConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
