@@ -19,7 +19,7 @@ from torchrl.envs import InitTracker, TransformedEnv
 
 from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
-from magrl.checks import check_choice, short
+from magrl.checks import check_choice, check_number, short
 from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
 from magrl.evaluation.navigators import fitted, make_navigator, named
@@ -69,6 +69,8 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
         >>> [score(agent, "box", episodes=8)["SR"] for agent in ("secant", straight)]
         [100.0, 0.0]
     """
+    check_number(1, whole=True, episodes=episodes)
+    check_number(0, whole=True, seed=seed)
     return scored(flown(agent, task_name(task), episodes=episodes, seed=seed, **options))
 
 
@@ -104,11 +106,16 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
     """Return an agent as a policy, or the text of a navigator, which is made for an environment."""
     if isinstance(agent, str | Path):
         return _of_text(str(agent))
+    if isinstance(agent, type):
+        raise TypeError(f"agent must be an object, got the class {agent.__name__}: make one")
     if isinstance(agent, TensorDictModuleBase):
         return agent
     if hasattr(agent, "predict"):
         return _Arrays(lambda seen, state, first: agent.predict(seen, state, first, deterministic=True))
     if isinstance(agent, nn.Module):
+        for weight in agent.parameters():
+            if weight.is_floating_point() and weight.dtype != torch.float32:
+                raise TypeError(f"agent must have float32 weights, as observations are, got {weight.dtype}: .float()")
         return TensorDictModule(agent, ["observation"], ["action"])
     if not callable(agent):
         wanted = "the name or file of a navigator, a module, a model with predict, or a function of observations"
@@ -119,9 +126,13 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
 
 
 def _takes_state(act: Callable[..., Any]) -> bool:
-    """Return whether a function has two arguments without a default."""
-    given = inspect.signature(act).parameters.values()
-    return sum(x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD) for x in given) == 2
+    """Return whether a function has two arguments, of which the second is ``state`` or has no default."""
+    given = list(inspect.signature(act).parameters.values())
+    if any(x.kind is x.VAR_POSITIONAL for x in given):
+        wanted = "act(observations) or act(observations, state)"
+        raise TypeError(f"agent must be {wanted}, got {short(act)} of any number of arguments: name its arguments")
+    placed = [x for x in given if x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
+    return len(placed) > 1 and (placed[1].default is inspect.Parameter.empty or placed[1].name == "state")
 
 
 def _of_text(text: str) -> TensorDictModuleBase | str:
