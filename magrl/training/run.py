@@ -152,6 +152,8 @@ class Run:
         return self
 
     def __exit__(self, *error: Any) -> None:
+        if error[0] is KeyboardInterrupt and self.statistics.frames:
+            self._say_how_to_resume()
         self._exits.__exit__(*error)
 
     def _discard(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -351,10 +353,14 @@ class Run:
     def _report_stop(self) -> None:
         print(
             f"\nStopped after {self.statistics.frames} frames; "
-            f"the policy so far is {self.folder / 'policy.safetensors'}\nTo resume: --resume {self.folder}",
+            f"the policy so far is {self.folder / 'policy.safetensors'}",
             file=sys.stderr,
         )
+        self._say_how_to_resume()
         raise SystemExit(self.stop.exit_code)
+
+    def _say_how_to_resume(self) -> None:
+        print(f"To resume: --resume {self.folder}", file=sys.stderr)
 
     def _report(self, result: dict[str, float]) -> None:
         arrived = "no episode arrived"

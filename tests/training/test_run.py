@@ -151,6 +151,14 @@ def test_training_seconds_count_from_the_start_of_the_run(tmp_path: Path, signal
         assert [row["seconds"] for row in csv.DictReader(file)] == ["100", "200", "200"]
 
 
+@pytest.mark.usefixtures("without_figures")
+def test_a_second_ctrl_c_says_how_to_resume(tmp_path: Path, signalled, capsys) -> None:
+    """It ends the training at once, without a new checkpoint."""
+    with signalled(3, signal.SIGINT), signalled(3, signal.SIGINT), pytest.raises(KeyboardInterrupt):
+        train(tmp_path)
+    assert f"To resume: --resume {tmp_path}\n" in capsys.readouterr().err
+
+
 @pytest.mark.filterwarnings("ignore:.*trying the previous checkpoint")
 @pytest.mark.usefixtures("without_figures")
 def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> None:
