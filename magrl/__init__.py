@@ -10,6 +10,8 @@ import os as _os
 import gymnasium as _gymnasium
 import lazy_loader as _lazy_loader
 
+from magrl.registry import NAMED_TASKS as _NAMED_TASKS
+
 _os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 __version__ = "0.2.0"
@@ -28,13 +30,12 @@ def __getattr__(name: str) -> object:
     return getattr(gymnasium, name)
 
 
-_TASKS = {"-v0": 16.8, "Anywhere-v1": 16.3, "Readings-v1": 16.3, "Storm-v1": 15.5, "NoGo-v0": 16.0}
-for _id, _threshold in _TASKS.items():
-    if f"magrl/GeomagneticNavigation{_id}" not in _gymnasium.registry:
+for _name, _task in _NAMED_TASKS.items():
+    if _task.id not in _gymnasium.registry:
         _gymnasium.register(
-            f"magrl/GeomagneticNavigation{_id}",
+            _task.id,
             entry_point="magrl:GeomagneticNavGymEnv",
             vector_entry_point="magrl:GeomagneticNavVectorEnv",
-            reward_threshold=_threshold,
-            kwargs={"task": _id.split("-")[0].lower() or "box"},
+            reward_threshold=_task.threshold,
+            kwargs={"task": _name},
         )

@@ -1,18 +1,18 @@
 """Compare navigators on the same tasks, as in Section 4.4 of the paper.
 
     python recipes/evaluate.py secant parallel                                  # without training
-    python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso --out runs/comparison
+    python recipes/evaluate.py runs/A runs/B runs/C ga pso --out runs/comparison    # agents by their run folders
     python recipes/evaluate.py secant --scenario my.toml                            # own tasks
-    python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
+    python recipes/evaluate.py secant runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
     python recipes/evaluate.py kalman --errors 0.05 0.05 5 --north magnetic     # without a true-north reference
     python recipes/evaluate.py secant kalman --arrival distance --radius-km 25 --max-steps 80 --altitude-km -3
-    python recipes/evaluate.py sac.onnx secant                                  # a policy of another algorithm
+    python recipes/evaluate.py SAC=sac.onnx secant                              # a policy of another algorithm
 
-Trained agents are named by their run folders. By default, scenario, arrival threshold, start heading and sensor noise
-are as in the training, from the file of the policy. If the runs differ in one of these, give its option. A line below
-the table names the settings that an option overrides. Metaheuristics read the field at the end of every candidate leg
-for free (an oracle).
+A file or run folder says what its agent is, and runs of the same are one row. By default, scenario, arrival threshold,
+start heading and sensor noise are as in the training, from the file of the policy. If the runs differ in one of these,
+give its option. A line below the table names the settings that an option overrides. Metaheuristics read the field at
+the end of every candidate leg for free (an oracle).
 
 Prints the main measures. Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json,
 settings.json, table.md (all measures) and trajectories.png (the first tasks of each navigator).
@@ -34,7 +34,7 @@ from magrl.envs import load_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.navigators import check_distinct, label, training_settings
+from magrl.evaluation.navigators import Kind, check_distinct, named, training_settings
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json, write_text, write_with
@@ -68,8 +68,7 @@ class Config(ScenarioOptions):
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
     """Navigators: anywhere, memory, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa.
-    Trained agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN, memory=RUN.
-    Policies of any algorithm by file: FILE, or policy:LABEL=FILE with a label."""
+    Trained agents and policies of any algorithm by run folder or file: PATH, or LABEL=PATH for a label of its own."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
@@ -100,7 +99,7 @@ class Config(ScenarioOptions):
 class Results:
     """Rows of the files that an evaluation writes."""
 
-    summaries: dict[str, list[dict[str, float]]] = field(default_factory=dict)
+    summaries: dict[Kind, list[dict[str, float]]] = field(default_factory=dict)
     runs: list[dict[str, Any]] = field(default_factory=list)
     episodes: list[dict[str, Any]] = field(default_factory=list)
     paths: list[dict[str, Any]] = field(default_factory=list)
@@ -170,22 +169,23 @@ def evaluate(config: Config) -> str:
     config, (flight, example_flight), navigators, notes = prepare(config)
     results = Results()
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
-        name, _, run = text.partition("=")
+        kind, source, _ = named(text)
+        name, run = kind.name, source.name if source else ""
         began = time.perf_counter()
         rollout = flight.fly(navigator).cpu()
         measured = episode_measures(rollout)
         readings = getattr(navigator, "readings_per_step", 0) * measured["steps"].double().mean().item()
         summary = summarize(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
-        number = len(results.summaries.setdefault(name, []))
-        results.summaries[name].append(summary)
-        results.runs.append({"navigator": name, "run": number, "source": Path(run).name, **summary})
+        number = len(results.summaries.setdefault(kind, []))
+        results.summaries[kind].append(summary)
+        results.runs.append({"navigator": name, "run": number, "source": run, **summary})
         columns = {key: measured[key].tolist() for key in (*MEASURES, "false_arrival") if key in measured}
         results.episodes += [
             {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
             for task in range(flight.base.num_envs)
         ]
         if number == 0:
-            results.rollouts[label(name)] = rollout[:SHOWN].clone()
+            results.rollouts[kind.description] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, example_flight.fly(example).cpu())
     below = text_below(config, flight, notes)
     write(config, flight, results, below)
@@ -194,9 +194,9 @@ def evaluate(config: Config) -> str:
 
 def settings(config: Config, flight: Flight) -> dict[str, Any]:
     """Return what was flown and how, without a path of this machine."""
-    texts, env = (text.partition("=") for text in config.navigators), flight.base
+    given, env = map(named, config.navigators), flight.base
     return {
-        "navigators": [f"{name}{equals}{Path(run).name}" for name, equals, run in texts],
+        "navigators": [f"{kind.name}={source.name}" if source else kind.name for kind, source, _ in given],
         "num_tasks": env.num_envs,
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
@@ -241,7 +241,7 @@ def write(config: Config, flight: Flight, results: Results, below: str) -> None:
         writer.writeheader()
         writer.writerows(rows)
         write_text(config.out / f"{name}.csv", text.getvalue())
-    write_json(config.out / "summary.json", results.summaries)
+    write_json(config.out / "summary.json", {kind.name: runs for kind, runs in results.summaries.items()})
     write_json(config.out / "settings.json", settings(config, flight))
     whole = comparison_table(results.summaries, published=not config.scenario)
     write_text(config.out / "table.md", whole + below)

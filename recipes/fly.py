@@ -25,7 +25,7 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import Flight, episode_measures
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.navigators import needs
+from magrl.evaluation.navigators import named
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
@@ -58,7 +58,7 @@ class Config:
     destination: tyro.conf.Positional[str]
     """Destination, such as a start."""
     navigator: str = "anywhere"
-    """Navigator: anywhere (pretrained), anywhere=RUN (a run folder), kalman, secant, ..., as in evaluate.py."""
+    """Navigator: anywhere (pretrained), kalman, secant, ..., or a run folder or file, as in evaluate.py."""
     errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
     """White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle.
     Vehicles are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (docs/results.md)."""
@@ -192,7 +192,7 @@ def draw(
     config: Config, steps: dict[str, TensorDictBase], measures: dict[str, dict[str, Any]], base: GeomagneticNavEnv
 ) -> None:
     """Write the picture and, where asked for, the tracks and the animation."""
-    navigator, route = config.navigator.partition("=")[0], config.title or f"{config.start} to {config.destination}"
+    navigator, route = named(config.navigator).kind.name, config.title or f"{config.start} to {config.destination}"
     titles = [
         f"{rule.replace('_', ' an arrival ')}: {values['outcome']}, {values['length_km']:.0f} km"
         for rule, values in measures.items()
@@ -217,12 +217,12 @@ def fly(config: Config) -> dict[str, Any]:
     }
     base, first = flights["with_signal"][0].base_env, steps["with_signal"][0, 0]
     last = steps["without_signal"]["next"][0, -1]
-    name = config.navigator.partition("=")[0]
+    kind = named(config.navigator).kind
     result = {
         **{key: value for key, value in asdict(config).items() if key != "out"},
-        "navigator": name,
+        "navigator": kind.name,
         "north": "true" if first.get("true_target_field", None) is None else "magnetic",  # also of a preset
-        "needs": needs(name),
+        "needs": kind.needs,
         **{key: getattr(base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position")},
         "target_field": first.get("true_target_field", first["target_field"]).tolist(),

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from magrl import Anywhere, paper
 from magrl.agents import make_correcting_actor, optimize
@@ -24,12 +24,13 @@ from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
+from magrl.training.config import Count, Discount, Noise, NonNegative, PlanetConfig, Positive, Rising, Threshold, Widths
 from magrl.training.run import make_collector
 from magrl.transforms import (
     DeclareArrival,
     HighestSPL,
     MinMaxNorm,
+    MotionError,
     RandomStepPrice,
     SensorErrors,
     SPLReward,
@@ -40,6 +41,7 @@ from magrl.transforms import (
 from magrl.transforms.track import known_keys
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch.optim import Adam
@@ -76,6 +78,20 @@ class Config(PlanetConfig):
     epochs: Count = 3
     batch_size: Count = 16_384
 
+    zeta: Threshold = 0.01
+    """Arrival threshold on the objective (Eq. 2-7), below 3."""
+    max_move_km: Positive = 50.0
+    """Longest leg [km]."""
+    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
+    """Largest turn to either side before a leg [deg]."""
+    drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
+    noise: Noise = (0.0, 0.0, 0.0)
+    """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT]; random levels by default."""
+    noise_exponent: Positive = 1.0
+    """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
+    num_cells: Widths = (128, 128, 128)
+    """Width of each hidden layer."""
     arrival: Literal["objective", "declared"] = "objective"
     """Rule of arrival: by the objective, or declared by the vehicle within ``radius_km``."""
     radius_km: Positive = 25.0
@@ -89,6 +105,17 @@ class Config(PlanetConfig):
     advantage_floor: NonNegative = 0.2
     """Constant added to the expected loss that divides advantages; it limits the weight of easy episodes."""
 
+    @property
+    def limits(self) -> dict[str, float]:
+        """Options of the environment."""
+        drift_km = self.drift * self.max_move_km
+        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
+
+    @property
+    def reach_km(self) -> float:
+        """Farthest that a leg takes a vehicle [km]."""
+        return self.max_move_km + self.limits["drift_km"]
+
 
 FAR = Config()
 FAST = Config(preset="fast", distance_range_km=(300.0, 500.0), max_steps=50, noise_exponent=1.5, total_frames=1_310_720)
@@ -97,8 +124,9 @@ PRESETS = {"far": FAR, "fast": FAST}
 
 def errors(config: Config, seed: int) -> list[Transform]:
     """Return the drift and the noise of the sensors: from the settings, or levels drawn for each episode."""
+    current = [MotionError(current_km_h=config.drift, speed_km_h=1.0, seed=seed)] if config.drift else []
     levels = None if any(config.noise) else partial(sensor_levels, exponent=config.noise_exponent)
-    return [*config.motion(seed), SensorErrors(config.noise, levels=levels, seed=seed)]
+    return [*current, SensorErrors(config.noise, levels=levels, seed=seed)]
 
 
 def rules_of(base: GeomagneticNavEnv, config: Config) -> Rules:

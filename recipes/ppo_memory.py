@@ -15,7 +15,7 @@ the record, which no training sees either.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from magrl import paper
 from magrl.agents import optimize
@@ -30,7 +30,6 @@ from magrl.transforms.areas import turned
 from magrl.transforms.sequences import READING_SIZE
 
 import torch
-from pydantic import model_validator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -76,12 +75,6 @@ class Config(PlanetConfig):
     """Collected batches before the first update of the legs; until then, the vehicle follows its estimate."""
     sequences: Count = 128
     """Sequences per gradient step of the memory."""
-
-    @model_validator(mode="after")
-    def _of_the_task(self) -> Self:
-        if any(self.noise) or self.drift:
-            raise ValueError(f"noise and drift are the task's, got {self.noise} and {self.drift}")
-        return self
 
 
 STANDARD = Config()

@@ -18,10 +18,11 @@ from typing import Annotated, Literal
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import NO_GO_STEPS, guidance_pair
+from magrl.envs.navigation import guidance_pair, task_transforms
 from magrl.envs.specs import REWARD_TERMS
+from magrl.registry import NAMED_TASKS
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
+from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig
 from magrl.training.run import make_collector
 from magrl.transforms import (
     AlignmentReward,
@@ -29,11 +30,9 @@ from magrl.transforms import (
     EpisodeSum,
     FieldGradient,
     GradientHeading,
-    NoGoAreas,
     ObservationView,
     ProgressReward,
     SensorErrors,
-    TrueWay,
 )
 
 import torch
@@ -51,7 +50,7 @@ LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_
 ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
-class Config(RunConfig):
+class Config(RegionConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
@@ -155,9 +154,10 @@ PRESETS["nogo"] = Config(
 PRESETS["td3-paper"] = PAPER.replace(preset="td3-paper", guided=False)
 
 
-def areas(config: Config) -> list[Transform]:
-    """Return no-go areas and the reward for progress that stops at them, in the unit of the paper's; none on *Box*."""
-    return [TrueWay(), NoGoAreas(), ProgressReward(), RewardScaling(0.0, 20.0)] if config.task == "nogo" else []
+def of_the_task(config: Config) -> list[Transform]:
+    """Return the transforms of the task, and the reward for progress in the unit of the paper's; none on *Box*."""
+    transforms = task_transforms(config.task)
+    return transforms and [*transforms, ProgressReward(), RewardScaling(0.0, 20.0)]
 
 
 def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:
@@ -170,11 +170,12 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     ]
     sensors = [SensorErrors(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
-    terms = [*(REWARD_TERMS if config.task == "box" else ()), *(keys[1:] if config.guided else ())]
+    task = of_the_task(config)
+    terms = [*(() if task else REWARD_TERMS), *(keys[1:] if config.guided else ())]
     sums = [RewardSum(), *([EpisodeSum(terms)] if terms else [])]
     rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
     guided = guidance if config.guided else []
-    return TransformedEnv(base, Compose(*areas(config), *guided, *sensors, *scaling, *rewards))
+    return TransformedEnv(base, Compose(*task, *guided, *sensors, *scaling, *rewards))
 
 
 def make_collection(
@@ -204,14 +205,14 @@ def train(config: Config) -> dict[str, float]:
     """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
     torch.manual_seed(config.seed)
     name = f"td3_gradient_guided-{config.preset}" if config.guided else f"td3-{config.preset.removeprefix('td3-')}"
-    name += "-nogo" if config.task == "nogo" != config.preset else ""
+    name += f"-{config.task}" if config.task not in ("box", config.preset) else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        options = config.model_dump(include=ENV_OPTIONS) | ({"max_steps": NO_GO_STEPS} if config.task == "nogo" else {})
+        options = {**config.model_dump(include=ENV_OPTIONS), **NAMED_TASKS[config.task].options}
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
-        validation, test = run.evaluation_envs(*areas(config), **options)
+        validation, test = run.evaluation_envs(*of_the_task(config), **options)
         observed = config.model_dump(include={"observe_heading", "observe_difference"})
-        view = base.observation_view(**observed, observe_areas=config.task == "nogo")
+        view = base.observation_view(**observed, observe_areas="areas" in validation.observation_spec.keys())  # noqa: SIM118
         env = make_env(base, view, config)
 
         # Networks

@@ -16,7 +16,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, NonNegative, Positive, RunConfig, Share
+from magrl.training.config import Count, NonNegative, Positive, RegionConfig, Share
 from magrl.training.run import make_collector
 from magrl.transforms import (
     AlignmentReward,
@@ -45,7 +45,7 @@ NEXT = ("observation", "reward", "done", "terminated")
 TRANSITION = ("observation", "action", "action_log_prob", *(("next", k) for k in NEXT))
 
 
-class Config(RunConfig):
+class Config(RegionConfig):
     """Settings of a training."""
 
     # Own defaults of shared settings

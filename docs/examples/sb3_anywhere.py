@@ -41,6 +41,6 @@ earth = earth.with_tasks(earth.random_tasks(num_tasks, seed=2))
 noise = (0.05, 0.05, 5.0)
 env = anywhere_env(num_tasks, scenario=earth, transforms=[SensorErrors(noise)])
 rollout = evaluation_rollout(env, TensorDictModule(act, ["observation"], ["action"]))
-rows = {"policy:PPO of stable-baselines3": [summarize(episode_measures(rollout))]}
+rows = {"PPO of stable-baselines3": [summarize(episode_measures(rollout))]}
 rows |= {name: [summarize(evaluate(name, earth, errors=noise))] for name in ("anywhere", "kalman")}
 print(short_table(rows))

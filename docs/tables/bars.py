@@ -21,6 +21,7 @@ from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
 from magrl.geodesy import steer
 from magrl.navigators import Navigator, Secant
+from magrl.registry import NAMED_TASKS
 from magrl.training import command
 from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, turned
 
@@ -152,13 +153,12 @@ def bar(task: str, navigator: str) -> dict[str, float]:
         task: name of the task.
         navigator: one of :data:`BARS`, or the file of a policy.
     """
-    return scored(flown("anywhere" if task == "readings" else task, navigator)[1])
+    return scored(flown(task, navigator)[1])
 
 
 def bars_of(task: str) -> list[str]:
     """Return the bars of a task, the oracle last."""
-    others = {"nogo": ["around", "sighted", "detour"], "storm": ["told", "geodesic"]}
-    return ["secant", "kalman", "anywhere", *others.get(task, ["geodesic"])]
+    return ["secant", "kalman", "anywhere", *NAMED_TASKS[task].bars]
 
 
 def draw_areas(axes: Axes, vehicle: int = 1) -> None:
@@ -179,8 +179,7 @@ def main() -> None:
     """Fly all navigators and print the table."""
     rows = [
         [task, BARS[name], *(f"{bar(task, name)[key]:.1f}" for key in COLUMNS)]
-        for task in NAMED_ENVS
-        if task != "readings"
+        for task in NAMED_TASKS
         for name in bars_of(task)
     ]
     print(markdown_table(["task", "navigator", "SR [%]", "SPL [%]", "steps", "return"], rows))

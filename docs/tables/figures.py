@@ -21,7 +21,7 @@ from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation.maps import coastlines
-from magrl.evaluation.navigators import label
+from magrl.evaluation.navigators import KINDS
 from magrl.field import IGRF, elements_gradient_at
 from magrl.files import check_writable, read_text, write_text, write_with
 from magrl.training import UsageError, command
@@ -121,7 +121,8 @@ def curves(data: DataFrame, column: str, label: str) -> Figure:
 def look(navigator: str) -> dict[str, Any]:
     """Return color, marker and label of a navigator in panels."""
     color, marker = LOOKS[navigator]
-    return {"color": color, "marker": marker, "label": label(navigator).partition(" (")[0], "ms": 4, "lw": 1.3}
+    label = KINDS[navigator].description.partition(" (")[0]
+    return {"color": color, "marker": marker, "label": label, "ms": 4, "lw": 1.3}
 
 
 def one_error(lines: str, size: object = "") -> Conditions:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from magrl.benchmark import TRACKS, Track
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
+from magrl.evaluation.navigators import named
 from magrl.evaluation.tables import about, mean_of_runs
 from magrl.files import check_writable, write_with
 from magrl.geodesy import geodesic, move_place, polar
@@ -161,8 +162,8 @@ def matching(pattern: str) -> list[str]:
 
 def runs_of(navigator: Spec) -> list[Spec]:
     """Return a navigator once for each run that its pattern names."""
-    name, _, pattern = navigator.partition("=") if isinstance(navigator, str) else ("", "", "")
-    return [f"{name}={run}" for run in matching(pattern)] if "*" in pattern else [navigator]
+    label, equals, pattern = navigator.rpartition("=") if isinstance(navigator, str) else ("", "", "")
+    return [f"{label}{equals}{run}" for run in matching(pattern)] if "*" in pattern else [navigator]
 
 
 def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
@@ -182,7 +183,7 @@ def names(navigator: Spec) -> list[str]:
     tell it nothing of its destination.
     """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    text, trained, given = about(options.pop("name").partition("=")[0])
+    text, trained, given = about(named(runs_of(options.pop("name"))[0]).kind)
     model, start_km, target_std = (options.pop(key, None) for key in ("model", "start_km", "target_std"))
     told = [] if model is None else [model]
     if start_km is not None:

@@ -147,9 +147,9 @@ def make(
     changes = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in tables if name not in specs]:
         raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(specs)}")
-    check_distinct(navigators or ())
     for name in tables or specs:
         try:
+            check_distinct([run for navigator in navigators or () for run in runs_of(navigator)])
             with tempfile.TemporaryDirectory() as folder:  # a table that is changed replaces no results
                 made = table(**specs[name] | changes, folder=(Path(folder) if changes else RUNS) / name)
         except (ValueError, OSError, TypeError) as error:

@@ -92,7 +92,7 @@ def cell(agents: list[str], task: str, options: dict[str, Any], episodes: int) -
 
 def trained(runs: Path, task: str) -> list[str]:
     """Return the agents of the sweep on a task."""
-    return [f"memory={path}" for path in sorted(runs.glob(f"{task}-ppo_memory-seed*/policy.safetensors"))]
+    return [str(path) for path in sorted(runs.glob(f"{task}-ppo_memory-seed*/policy.safetensors"))]
 
 
 def main(config: Config) -> None:

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 from magrl import earth_scenario
 from magrl.envs import Region
-from magrl.envs.navigation import NAMED_ENVS
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
 from magrl.evaluation import Flight, episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
@@ -27,6 +26,7 @@ from magrl.field import IGRF, FieldModel
 from magrl.field.elements import UNITS
 from magrl.files import write_with
 from magrl.geodesy import geodesic
+from magrl.registry import NAMED_TASKS
 from magrl.training import command
 from magrl.transforms import CONDITIONS
 from magrl.transforms.areas import outlines
@@ -55,10 +55,8 @@ COUNTER = ((0.63, "black"), (0.65, GRAY), (0.785, "black"), (0.82, BLUE))
 """Place and color of each part of the counter."""
 PIECE_KM, FRAME_MS, LAST_MS = 6.0, 120, 3000
 """Longest distance between two frames, and their durations."""
-REFERENCES = dict.fromkeys(NAMED_ENVS, "kalman") | {"nogo": "detour"}
-"""Agent of bars.py, by task."""
-COLORS, VEHICLES, EPISODES = 256, 16, {"box": 3, "anywhere": 2, "readings": 5, "storm": 4, "nogo": 7}
-"""Colors of a map, vehicles of a rollout, and the one that is shown, by task."""
+COLORS, VEHICLES = 256, 16
+"""Colors of a map, vehicles of a rollout."""
 
 
 class Trip(NamedTuple):
@@ -194,9 +192,10 @@ def draw_map(axes: Axes, field: FieldModel, places: Tensor, *, coast: bool = Tru
 
 
 def task_picture(task: str) -> Figure:
-    """Return a map of an episode of the reference agent, or on *Storm* the errors of its readings."""
-    env, rollout = flown("anywhere" if task == "readings" else task, REFERENCES[task], VEHICLES)
-    steps = rollout[EPISODES[task]]
+    """Return a map of an episode, or on *Storm* the errors of its readings."""
+    navigator, episode = NAMED_TASKS[task].picture
+    env, rollout = flown(task, navigator, VEHICLES)
+    steps = rollout[episode]
     steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
     figure = Figure(figsize=(3, 3), dpi=100)
     if task == "storm":
@@ -206,8 +205,9 @@ def task_picture(task: str) -> Figure:
     field = partial(env.field, index=index) if len(env.region) > 1 else env.field
     path = env.region[index].unwrapped(torch.cat((steps["position"][:1], steps["next", "position"])).double())
     target = env.region[index].unwrapped(steps["target_position"][:1].double())
-    rings = outlines(steps["no_go_areas"][0], target[0]) if task == "nogo" else path.new_empty(0, 1, 2)
-    draw_map(axes, field, torch.cat((path, target, rings.flatten(0, 1))), coast=task in ("box", "nogo"))
+    areas = steps.get("no_go_areas", None)
+    rings = path.new_empty(0, 1, 2) if areas is None else outlines(areas[0], target[0])
+    draw_map(axes, field, torch.cat((path, target, rings.flatten(0, 1))), coast=len(env.region) == 1)
     for ring in rings:
         axes.fill(*ring.T.flip(0), color=AREA, alpha=0.5)
     axes.plot(*path.T.flip(0), ".-", color=BLUE, lw=2, ms=8)
@@ -246,7 +246,7 @@ def main(out: Path = Path("docs/figures")) -> None:
     (reckoning, few), (filtered, many) = flights.values()
     frames = Animation(target, reckoning, filtered).frames(f"dead reckoning {few} of 100,\nmagrl {many} of 100 arrive")
     save_gif(out / "underwater.gif", list(frames))
-    for task in NAMED_ENVS:
+    for task in NAMED_TASKS:
         picture = image_of(task_picture(task)).quantize(COLORS)
         write_with(out / f"task-{task}.png", partial(picture.save, format="PNG"))
 

@@ -11,8 +11,7 @@ from typing import Any
 
 from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
-from magrl.evaluation.navigators import KINDS, NAVIGATOR_NAMES
-from magrl.evaluation.navigators import label as navigator_label
+from magrl.evaluation.navigators import KINDS
 from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
 
@@ -22,16 +21,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
-_COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
+_COLORS = ["#D55E00", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
+_COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733", "#0072B2"]
 NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
 """Color of each navigator in every figure."""
 
 
 def _look(name: str, index: int = 0) -> dict[str, Any]:
-    """Return color and label of a navigator; those without a color of their own have one by their index."""
-    text = navigator_label(name)  # raises for an unknown name
-    return {"color": NAVIGATOR_COLORS.get(name, f"C{index}"), "label": NAVIGATOR_NAMES.get(name, text)}
+    """Return color and label of a navigator, given its name or a label; a label has a color by its index."""
+    return {"color": NAVIGATOR_COLORS.get(name, f"C{index}"), "label": KINDS[name].label if name in KINDS else name}
 
 
 def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
@@ -53,9 +51,6 @@ def learning_curves(
         curves: by navigator, for each run its frames and its values; NaN is left out.
         label: label of the vertical axis.
         points: number of points of the mean.
-
-    Raises:
-        ValueError: for an unknown navigator.
 
     Example:
         >>> figure = learning_curves({"td3": [([0, 100], [0.0, 50.0]), ([0, 100], [10.0, 70.0])]}, "SPL [%]")
@@ -92,9 +87,6 @@ def compared_trajectories(
         field: any model of :mod:`magrl.field`.
         task: one task.
 
-    Raises:
-        ValueError: for an unknown navigator.
-
     Example:
         >>> from magrl.field.igrf import IGRF
         >>> from magrl.envs.tasks import named_tasks
@@ -125,9 +117,6 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
         field: any model of :mod:`magrl.field`, for the target's values.
         task: the task of all navigators.
 
-    Raises:
-        ValueError: for an unknown navigator.
-
     Example:
         >>> from magrl.field.igrf import IGRF
         >>> from magrl.envs.tasks import named_tasks
@@ -157,9 +146,6 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     Args:
         measures: by navigator, one value for each episode of ``heading_mae_deg``, ``heading_rmse_deg``,
             ``smoothness_deg`` and ``navigation_error_km``; NaN is left out.
-
-    Raises:
-        ValueError: for an unknown navigator.
 
     Example:
         >>> measures = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")

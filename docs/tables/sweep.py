@@ -25,7 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -35,12 +35,14 @@ from agents import keep_agents, save_agent
 from bars import BARS, VEHICLES, bar, bars_of, draw_areas
 from flights import write_picture
 from magrl import score
+from magrl.checks import check_choice
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
-from magrl.envs.navigation import NAMED_ENVS
+from magrl.envs.navigation import task_name
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
+from magrl.registry import NAMED_TASKS
 from magrl.training import UsageError, command
 
 import numpy as np
@@ -61,11 +63,10 @@ Row = dict[str, Any]
 
 
 class Algorithm(NamedTuple):
-    """An algorithm: how to make it, vehicles, steps on each task [thousands], and its settings."""
+    """An algorithm: how to make it, vehicles, and its settings."""
 
     make: Callable[..., Any]
     num_envs: int
-    thousands: dict[str, int]
     settings: dict[str, Any]
 
 
@@ -75,29 +76,23 @@ OFF_POLICY |= {"gamma": 0.9, "tau": 0.01, "buffer_size": 200_000, "policy_kwargs
 EXPLORED = {"action_noise": NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))}
 WIDE = {"policy_kwargs": {"net_arch": [64, 64], "log_std_init": -0.5}}
 ALGORITHMS = {
-    "PPO": Algorithm(
-        partial(PPO, "MlpPolicy"),
-        256,
-        {"box": 1000, "nogo": 1000, "anywhere": 200, "readings": 500, "storm": 500},
-        ON_POLICY | WIDE,
-    ),
-    "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, {"box": 50, "nogo": 50}, OFF_POLICY),
-    "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, {"box": 50, "nogo": 50}, OFF_POLICY | EXPLORED),
+    "PPO": Algorithm(partial(PPO, "MlpPolicy"), 256, ON_POLICY | WIDE),
+    "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, OFF_POLICY),
+    "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, OFF_POLICY | EXPLORED),
 }
-RECIPES: dict[str, dict[str, tuple[str, ...]]] = {
-    "GG-TD3": {"box": ("td3_gradient_guided.py",)},
-    "TD3-magrl": {"nogo": ("td3_gradient_guided.py", "--task", "nogo")},
-    "ppo_anywhere": {"anywhere": ("ppo_anywhere.py", "--preset", "fast")},
-    "ppo_memory": {task: ("ppo_memory.py", "--task", task) for task in ("readings", "storm")},
+RECIPES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("GG-TD3", "TD3-magrl"), ("td3_gradient_guided.py", "--task", "TASK")),
+    "ppo_anywhere": ("ppo_anywhere.py", "--preset", "fast"),
+    "ppo_memory": ("ppo_memory.py", "--task", "TASK"),
 }
-"""Recipes: file and options by task."""
+"""Recipes: file and options."""
 
 
 @dataclass(frozen=True)
 class Config:
     """What to train, and where."""
 
-    tasks: tuple[str, ...] = tuple(NAMED_ENVS)
+    tasks: tuple[str, ...] = tuple(NAMED_TASKS)
     """Named tasks."""
     algorithms: tuple[str, ...] = (*ALGORITHMS, *RECIPES)
     """Algorithms; each is trained on its own tasks among these."""
@@ -144,7 +139,7 @@ def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
     chosen = ALGORITHMS[name]
     envs = GeomagneticNavVectorEnv(chosen.num_envs, task=task, autoreset_mode="SameStep")
     model = chosen.make(BatchedVecEnv(envs), seed=seed, device="cpu", **deepcopy(chosen.settings))
-    curve = Curve(task, 1000 * chosen.thousands[task])
+    curve = Curve(task, 1000 * NAMED_TASKS[task].budget[name])
     model.learn(curve.steps, callback=curve)
     curve.point()  # after the last update
     save_agent(agent, model.policy, task)
@@ -163,7 +158,7 @@ def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
     Raises:
         UsageError: with the last line that the recipe wrote, where it failed.
     """
-    script, *options = RECIPES[name][task]
+    script, *options = (part.replace("TASK", task) for part in RECIPES[name])
     began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
     line = [sys.executable, Path(__file__).parents[2] / "recipes" / script, *options]
@@ -193,8 +188,7 @@ def run(config: Config, task: str, name: str, seed: int) -> Path:
 def planned(config: Config) -> Iterator[tuple[str, str, int]]:
     """Yield task, algorithm and seed of all runs, in the order of their seeds."""
     for seed, name in itertools.product(config.seeds, config.algorithms):
-        tasks = RECIPES.get(name) or ALGORITHMS[name].thousands
-        yield from ((task, name, seed) for task in tasks if task in config.tasks)
+        yield from ((task, name, seed) for task in config.tasks if name in NAMED_TASKS[task].budget)
 
 
 def ends(curves: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:
@@ -217,13 +211,13 @@ def table(curves: DataFrame) -> str:
         for name in bars_of(task):
             scores = bar(task, name)
             rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in ("return", "SR", "SPL"))])
-    rows.sort(key=lambda row: list(NAMED_ENVS).index(row[0]))
+    rows.sort(key=lambda row: list(NAMED_TASKS).index(row[0]))
     return markdown_table(["task", "agent", "seeds × steps", "CPU", "return", "SR %", "SPL %"], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
     """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
-    tasks = [task for task in NAMED_ENVS if task in set(curves["task"])]
+    tasks = [task for task in NAMED_TASKS if task in set(curves["task"])]
     drawn = Figure(figsize=(10, 7.5), layout="constrained")
     for axes, task in zip(drawn.subplots(2, 3).flat, tasks, strict=False):
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
@@ -246,9 +240,12 @@ def figure(curves: DataFrame) -> Figure:
 def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, and write table, data and figure."""
     config = tyro.cli(Config, description=__doc__, args=args)
-    for name in (*config.tasks, *config.algorithms):
-        if name not in (known := (*NAMED_ENVS, *ALGORITHMS, *RECIPES)):
-            raise UsageError(f"unknown task or algorithm {name!r}: choose from {', '.join(known)}")
+    try:
+        config = replace(config, tasks=tuple(map(task_name, config.tasks)))
+        for name in config.algorithms:
+            check_choice((*ALGORITHMS, *RECIPES), algorithm=name)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
     config.out.mkdir(parents=True, exist_ok=True)
     check_writable(config.results / "scores.csv")
     jobs = list(planned(config))

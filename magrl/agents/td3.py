@@ -14,7 +14,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.data import Bounded
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
@@ -169,25 +168,17 @@ class SoftUpdate(TorchRLSoftUpdate):
     Example:
         >>> from magrl.agents.networks import make_actor, make_critic
         >>> loss = TD3Loss(make_actor(13, (8,)), make_critic(13, (8,)), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
-        >>> update = SoftUpdate(loss, tau=0.25)
-        >>> for weights, value in ((loss.actor_network_params, 1.0), (loss.target_actor_network_params, 0.0)):
-        ...     for weight in weights.data.values(True, True):
-        ...         _ = weight.fill_(value)
-        >>> update.step()
-        >>> next(loss.target_actor_network_params.data.values(True, True)).unique()
-        tensor([0.2500])
+        >>> SoftUpdate(loss, tau=0.25).step()
     """
 
     def step(self) -> None:
         """Move each target parameter by the share ``tau`` towards its source."""
-        get_ema_multi_avg_fn(self.eps)(*self._weights, 0)
+        targets, sources = self._pair
+        targets.lerp_(sources, 1 - self.eps)
 
     @cached_property
-    def _weights(self) -> list[list[Tensor]]:
-        """Target parameters, and their sources in the same order."""
-        names = ("actor_network_params", "qvalue_network_params")
-        groups = [[getattr(self.loss_module, prefix + name) for name in names] for prefix in ("target_", "")]
-        return [[leaf for group in each for leaf in group.data.values(True, True)] for each in groups]
+    def _pair(self) -> tuple[TensorDictBase, TensorDictBase]:
+        return self._targets.data, self._sources.data
 
 
 def saturation_penalty(logits: Tensor) -> Tensor:

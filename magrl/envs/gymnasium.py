@@ -1,9 +1,7 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
-``import magrl`` registers the named tasks: ``magrl/GeomagneticNavigation-v0``, which is *Box*, and with the endings
-``Anywhere-v1``, ``Readings-v1``, ``Storm-v1`` and ``NoGo-v0``. The classes run the
-TorchRL environments of :data:`magrl.envs.navigation.NAMED_ENVS`, and only convert tensors to arrays: the same seed and
-the same actions give the same bits.
+``import magrl`` registers the named tasks (:data:`magrl.registry.NAMED_TASKS`). The classes run their TorchRL
+environments, and only convert tensors to arrays: the same seed and the same actions give the same bits.
 """
 
 from __future__ import annotations
@@ -26,9 +24,8 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
 
-from magrl.checks import check_choice
 from magrl.envs.measures import path_measures
-from magrl.envs.navigation import NAMED_ENVS
+from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.envs.specs import PUBLIC_KEYS
 from magrl.transforms.areas import outlines
 
@@ -95,8 +92,9 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         render_mode: None, or ``"rgb_array"``: an image of each vehicle.
         autoreset_mode: mode, or its value: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         max_episode_steps: Gymnasium's name of ``max_steps``.
-        task: name of the task in :data:`magrl.envs.navigation.NAMED_ENVS`, which an id sets.
-        **options: of the function there, all of which take the options of :func:`magrl.envs.navigation.navigation_env`.
+        task: name or id of the task, which ``gymnasium.make`` sets.
+        **options: of its function in :data:`magrl.envs.navigation.NAMED_ENVS`; all take the options of
+            :func:`magrl.envs.navigation.navigation_env`.
 
     Raises:
         TypeError, ValueError: for a bad option, as that function.
@@ -127,8 +125,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)  # where TorchRL's GymWrapper reads it
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
-        check_choice(NAMED_ENVS, task=task)
-        self.torchrl_env = NAMED_ENVS[task](num_envs, render_mode=render_mode, **options)
+        self.torchrl_env = NAMED_ENVS[task_name(task)](num_envs, render_mode=render_mode, **options)
         observation = options.get("observation", "flat")  # or another array, by default of the task
         self._flat = isinstance(observation, str) and observation != "dict"
         areas = [key for key in ("areas",) if key in self.torchrl_env.observation_spec.keys()]  # noqa: SIM118

@@ -9,12 +9,14 @@ from typing import Any
 
 from torchrl.envs import CatTensors, Compose, RenameTransform, Transform, TransformedEnv
 
+from magrl import transforms as every_transform
 from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.random_regions import planet_scenario
 from magrl.envs.regions import PAPER_REGION
 from magrl.envs.scenario import Scenario
 from magrl.field import WeatherRecord
+from magrl.registry import NAMED_TASKS
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import STEP_PRICE, Rules
 from magrl.transforms import (
@@ -25,7 +27,6 @@ from magrl.transforms import (
     HighestSPL,
     MagneticWeather,
     MinMaxNorm,
-    NoGoAreas,
     ProgressReward,
     RandomStepPrice,
     ReadingObservation,
@@ -47,8 +48,6 @@ STORMS = 256
 """Storms of the trainings of *Storm*."""
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
-NO_GO_STEPS = 20
-"""Deadline of :func:`no_go_env`; chosen."""
 
 
 def navigation_env(
@@ -249,8 +248,8 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
         torch.Size([4, 3, 22])
     """
     check_choice(("progress", "spl"), reward=options.setdefault("reward", "progress"))
-    env = navigation_env(num_envs, **{"max_steps": NO_GO_STEPS} | options)
-    env.insert_transform(0, Compose(TrueWay(), NoGoAreas()))  # the reward reads the success that areas leave
+    env = navigation_env(num_envs, **{**NAMED_TASKS["nogo"].options, **options})
+    env.insert_transform(0, Compose(*task_transforms("nogo")))  # the reward reads the success that areas leave
     for last in [step for step in env.transform if "observation" in step.out_keys][-1:]:
         parts = last.in_keys if isinstance(last, CatTensors) else ["observation_without_areas"]
         if not isinstance(last, CatTensors):
@@ -262,10 +261,32 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 
 
 NAMED_ENVS: dict[str, Callable[..., TransformedEnv]] = {
-    "box": navigation_env,
-    "anywhere": anywhere_env,
-    "readings": readings_env,
-    "storm": storm_env,
-    "nogo": no_go_env,
+    name: globals()[task.make] for name, task in NAMED_TASKS.items()
 }
-"""Functions that make the environments of the named tasks."""
+"""Functions that make the environments of :data:`magrl.registry.NAMED_TASKS`."""
+
+
+def task_name(task: str) -> str:
+    """Return the name of a named task, given its name or its id with Gymnasium.
+
+    Raises:
+        ValueError: for another text, listing the names.
+
+    Example:
+        >>> task_name("nogo"), task_name("magrl/GeomagneticNavigationNoGo-v0")
+        ('nogo', 'nogo')
+    """
+    names = {row.id: name for name, row in NAMED_TASKS.items()}
+    name = names.get(task, task) if isinstance(task, str) else task
+    check_choice(list(NAMED_TASKS), task=name)
+    return name
+
+
+def task_transforms(task: str) -> list[Transform]:
+    """Return the transforms of a named task that change its arrival, before any reward.
+
+    Example:
+        >>> [type(part).__name__ for part in task_transforms("nogo")], task_transforms("box")
+        (['TrueWay', 'NoGoAreas'], [])
+    """
+    return [getattr(every_transform, name)() for name in NAMED_TASKS[task].transforms]

@@ -161,7 +161,7 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
 
     Args:
         policy: policy or navigator of the plain environment, or the text that names one, as
-            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.onnx"``. A
+            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"sac.onnx"``. A
             trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.

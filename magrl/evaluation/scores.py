@@ -16,12 +16,12 @@ from torch import nn
 
 from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
-from magrl.checks import check_choice, short
-from magrl.envs.navigation import NAMED_ENVS
+from magrl.checks import check_number, short
+from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
-from magrl.evaluation.navigators import OWN, make_navigator, parse_navigator, policy_file
-from magrl.navigators import NAVIGATORS, Navigator
+from magrl.evaluation.navigators import make_navigator, named
+from magrl.navigators import Navigator
 
 SEED = paper.FIRST_RESERVED_SEED + 69
 """Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
@@ -45,11 +45,11 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
             - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
               ``act(observations, state)`` returns actions and the next state, which is None at the start: arrays with
               the vehicles on their first or second axis, or a tuple, list or dict of them. It gets no other key.
-        task: name in :data:`magrl.envs.navigation.NAMED_ENVS`: ``"box"``, ``"anywhere"``, ``"readings"``, ``"storm"``,
-            ``"nogo"``.
+        task: name or id of a task in :data:`magrl.registry.NAMED_TASKS`: ``"nogo"``, or
+            ``"magrl/GeomagneticNavigationNoGo-v0"``.
         episodes: vehicles, each with one episode.
         seed: seed of the episodes; the default is reserved for evaluations.
-        options: of the function there. The score is then not the task's.
+        options: of its function in :mod:`magrl.envs.navigation`. The score is then not the task's.
 
     Returns:
         ``SR``, success rate [%]; ``SPL`` [%] with its bootstrap 95 % interval over episodes, ``SPL_low`` and
@@ -66,13 +66,14 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
         >>> [score(agent, "box", episodes=8)["SR"] for agent in ("secant", straight)]
         [100.0, 0.0]
     """
-    return scored(flown(agent, task, episodes=episodes, seed=seed, **options))
+    check_number(1, whole=True, episodes=episodes)
+    check_number(0, whole=True, seed=seed)
+    return scored(flown(agent, task_name(task), episodes=episodes, seed=seed, **options))
 
 
 def flown(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> TensorDict:
     """Return the rollout of :func:`score`, as :func:`magrl.evaluation.episode_measures` takes it."""
-    check_choice(NAMED_ENVS, task=task)
-    policy, make = _policy(agent), partial(NAMED_ENVS[task], episodes, seed=seed, **options)
+    policy, make = _policy(agent), partial(NAMED_ENVS[task_name(task)], episodes, seed=seed, **options)
     if isinstance(policy, str) or "observation" not in policy.in_keys:
         env = make(observation="dict", scale_actions=False)
         policy = make_navigator(policy, env.base_env) if isinstance(policy, str) else policy
@@ -101,11 +102,16 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
     """Return an agent as a policy, or the text of a navigator, which is made for an environment."""
     if isinstance(agent, str | Path):
         return _of_text(str(agent))
+    if isinstance(agent, type):
+        raise TypeError(f"agent must be an object, got the class {agent.__name__}: make one")
     if isinstance(agent, TensorDictModuleBase):
         return agent
     if hasattr(agent, "predict"):
         return ArrayPolicy(lambda seen, state, first: agent.predict(seen, state, first, deterministic=True))
     if isinstance(agent, nn.Module):
+        for weight in agent.parameters():
+            if weight.is_floating_point() and weight.dtype != torch.float32:
+                raise TypeError(f"agent must have float32 weights, as observations are, got {weight.dtype}: .float()")
         return TensorDictModule(agent, ["observation"], ["action"])
     if not callable(agent):
         wanted = "the name or file of a navigator, a module, a model with predict, or a function of observations"
@@ -116,17 +122,19 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
 
 
 def _takes_state(act: Callable[..., Any]) -> bool:
-    """Return whether a function has two arguments without a default."""
-    given = inspect.signature(act).parameters.values()
-    return sum(x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD) for x in given) == 2
+    """Return whether a function has two arguments, of which the second is ``state`` or has no default."""
+    given = list(inspect.signature(act).parameters.values())
+    if any(x.kind is x.VAR_POSITIONAL for x in given):
+        wanted = "act(observations) or act(observations, state)"
+        raise TypeError(f"agent must be {wanted}, got {short(act)} of any number of arguments: name its arguments")
+    placed = [x for x in given if x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
+    return len(placed) > 1 and (placed[1].default is inspect.Parameter.empty or placed[1].name == "state")
 
 
 def _of_text(text: str) -> TensorDictModuleBase | str:
     """Return the network of an ONNX file without a view as a policy; otherwise the text of a navigator."""
-    text = f"{OWN}={text}" if text not in NAVIGATORS and Path(text).is_dir() else text
-    source = parse_navigator(text).source
-    path = policy_file(source) if source else Path()
-    if path.suffix != ".onnx" or not path.is_file() or has_view(content := path.read_bytes()):
+    path = named(text).file
+    if path is None or path.suffix != ".onnx" or has_view(content := path.read_bytes()):
         return text
 
     network = lru_cache(partial(OnnxNetwork, content))

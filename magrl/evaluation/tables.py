@@ -14,13 +14,13 @@ import torch
 
 from magrl import paper
 from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
-from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs, parse_navigator, trained_on
+from magrl.evaluation.navigators import KINDS, Agent, Kind
 
 Summary = Mapping[str, float | None]
 """From :func:`magrl.evaluation.summarize`; a measure without a value is NaN, or None where it was read from a file."""
 
-Summaries = Mapping[str, Sequence[Summary]]
-"""By navigator, a summary of each of its runs."""
+Summaries = Mapping[Kind | str, Sequence[Summary]]
+"""By navigator, or its name in :data:`magrl.evaluation.navigators.KINDS`, or a label: a summary of each of its runs."""
 
 MIN_RUNS = 10
 """Minimum number of runs for a bootstrap interval whose coverage is about nominal."""
@@ -122,36 +122,36 @@ def comparison_table(summaries: Summaries, *, published: bool = True) -> str:
         summaries: by navigator, one summary for each run, with ``field_readings``.
         published: whether the paper's rows are shown; they are of its own region.
 
-    Raises:
-        ValueError: for an unknown navigator.
-
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
         | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — | — | — |
     """
-    rows, shown = list[list[object]](), set[str]()
-    for name, results in summaries.items():
-        base = parse_navigator(name).name
-        if published and base in paper.TABLE_2 and base not in shown:
-            shown.add(base)
-            published_row = [paper.TABLE_2[base]._asdict()]
-            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", "—", 1, *_cells(published_row)])
-        rows.append([*about(name), len(results), *_cells(results)])
+    rows = list[list[object]]()
+    for kind, results in summaries.items():
+        navigator = _known(kind)
+        if published and navigator.name in paper.TABLE_2:
+            published_row = [paper.TABLE_2[navigator.name]._asdict()]
+            rows.append([f"{navigator.label}, paper", "—", "—", 1, *_cells(published_row)])
+        rows.append([*about(kind), len(results), *_cells(results)])
     return markdown_table([*ABOUT, "runs", *COLUMNS], rows) + "\n"
 
 
-def about(name: str) -> list[str]:
+def about(kind: Kind | str) -> list[str]:
     """Return the label of a navigator, what it was trained on and what it is given, for the columns :data:`ABOUT`.
-
-    Raises:
-        ValueError: for an unknown name.
 
     Example:
         >>> about("kalman")
         ['Kalman (dual control)', 'nothing', "the field's spectrum"]
+        >>> about("PPO")
+        ['PPO', 'tasks of its own', 'nothing']
     """
-    return [label(name), trained_on(name), needs(name)]
+    navigator = _known(kind)
+    return [navigator.description, navigator.trained_on, navigator.needs]
+
+
+def _known(kind: Kind | str) -> Kind:
+    return KINDS.get(kind, Agent(kind, kind, kind)) if isinstance(kind, str) else kind
 
 
 def _cells(results: Sequence[Summary], heads: Iterable[str] = COLUMNS) -> list[str]:
@@ -186,13 +186,13 @@ def short_table(summaries: Summaries) -> str:
     Args:
         summaries: by navigator, one summary for each run.
 
-    Raises:
-        ValueError: for an unknown navigator.
-
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(short_table({"secant": [measures]}).splitlines()[2])
         | secant (quasi-Newton) | nothing | 1 | 1.0 | 1.00 | 1.00 | 1.0 | 1.0 |
     """
-    rows = [[label(name), needs(name), len(runs), *_cells(runs, SHORT_COLUMNS)] for name, runs in summaries.items()]
+    rows = []
+    for kind, runs in summaries.items():
+        label, _, given = about(kind)
+        rows.append([label, given, len(runs), *_cells(runs, SHORT_COLUMNS)])
     return markdown_table(["navigator", "given", "runs", *SHORT_COLUMNS], rows) + "\n"

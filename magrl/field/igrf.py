@@ -104,8 +104,10 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
     when, (epochs, tables) = np.datetime64(parse_date(date), "us"), _igrf_tables(generation)
     if not epochs[0] <= when <= epochs[-1]:
         first, last = epochs[[0, -1]].astype("M8[D]")
+        newest = GENERATIONS[-1]
+        hint = f": generation={newest} is valid then" if epochs[0] <= when <= _igrf_tables(newest)[0][-1] else ""
         raise ValueError(
-            f"date {when.item().isoformat()} is outside IGRF-{generation}, which is valid from {first} to {last}"
+            f"date {when.item().isoformat()} is outside IGRF-{generation}, which is valid from {first} to {last}{hint}"
         )
     right = np.searchsorted(epochs, when).clip(1)
     share = float((when - epochs[right - 1]) / (epochs[right] - epochs[right - 1]))

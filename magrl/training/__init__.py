@@ -2,6 +2,7 @@
 
 from magrl.checks import UsageError as UsageError
 from magrl.checks import command as command
+from magrl.training.config import RegionConfig as RegionConfig
 from magrl.training.config import RunConfig as RunConfig
 from magrl.training.config import parse as parse
 from magrl.training.config import parse_config as parse_config

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Self, TypeVar
 
 import tyro
 from pydantic import AfterValidator, Field, model_validator
-from torchrl.envs import Transform
 
 from magrl import paper
 from magrl.checks import CheckedModel, UsageError, check_device, printable, short
@@ -18,7 +17,6 @@ from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import check_zeta
 from magrl.files import read_document
 from magrl.training.loggers import Logger, WandbMode, check_logger
-from magrl.transforms import MotionError
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -82,14 +80,8 @@ class RunConfig(CheckedModel):
     """Collected batches between points of the curves; each evaluation is a point, too."""
     checkpoint_every: NonNegative = 30.0
     """Time between checkpoints [s]."""
-    scenario: Path | None = None
-    """Scenario file (.toml or .json) of region, date and altitude (docs/data.md); the paper's by default."""
     num_envs: Count = 512
     """Number of vehicles."""
-    zeta: Threshold = 0.01
-    """Arrival threshold on the objective (Eq. 2-7), below 3."""
-    noise: Noise = (0.0, 0.0, 0.0)
-    """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT], in training and evaluations."""
     total_frames: Count = 204_800
     """Total number of steps over all vehicles."""
     total_episodes: Count | None = None
@@ -100,21 +92,49 @@ class RunConfig(CheckedModel):
     """Number of validation tasks, by which the best policy is selected."""
     eval_tasks: Count = 1000
     """Number of test tasks of the final evaluation."""
-    num_cells: Widths = (128, 128, 128)
-    """Width of each hidden layer."""
     gamma: Discount = 0.9
     """Discount factor."""
     learning_rate: Positive = 2e-3
     """Learning rate of Adam at the start."""
     final_learning_rate: Positive = 4e-5
     """Learning rate of Adam at the end; linear in between."""
-    saturation_weight: NonNegative = 0.05
-    """Initial weight of the penalty on the actor's outputs before the tanh; decreases linearly to 0."""
 
     @model_validator(mode="after")
     def _available(self) -> Self:
         check_logger(self.logger, self.wandb_mode)
         check_device(self.device)
+        return self
+
+    def linear(self, name: str, remaining: float) -> float:
+        """Interpolate a setting linearly from ``name`` to ``final_name``, by the remaining share of the training."""
+        start, end = getattr(self, name), getattr(self, f"final_{name}")
+        return end + remaining * (start - end)
+
+
+class RegionConfig(RunConfig):
+    """Settings of recipes that train in the region of a scenario.
+
+    Raises:
+        ValueError: as :class:`RunConfig`, also for a scenario that says otherwise.
+
+    Example:
+        >>> RegionConfig(noise=(0.05, 0.05, 5.0)).zeta
+        0.01
+    """
+
+    scenario: Path | None = None
+    """Scenario file (.toml or .json) of region, date and altitude (docs/data.md); the paper's by default."""
+    zeta: Threshold = 0.01
+    """Arrival threshold on the objective (Eq. 2-7), below 3."""
+    noise: Noise = (0.0, 0.0, 0.0)
+    """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT], in training and evaluations."""
+    num_cells: Widths = (128, 128, 128)
+    """Width of each hidden layer."""
+    saturation_weight: NonNegative = 0.05
+    """Initial weight of the penalty on the actor's outputs before the tanh; decreases linearly to 0."""
+
+    @model_validator(mode="after")
+    def _of_the_scenario(self) -> Self:
         try:
             scenario = self.load_scenario()
         except OSError as error:
@@ -133,38 +153,25 @@ class RunConfig(CheckedModel):
         """Return the scenario of the file, or the paper's."""
         return Scenario() if self.scenario is None else load_scenario(self.scenario)
 
-    def linear(self, name: str, remaining: float) -> float:
-        """Interpolate a setting linearly from ``name`` to ``final_name``, by the remaining share of the training."""
-        start, end = getattr(self, name), getattr(self, f"final_{name}")
-        return end + remaining * (start - end)
-
 
 class PlanetConfig(RunConfig):
     """Settings of PPO recipes that train on random planets and learn corrections of legs.
 
     Example:
-        >>> PlanetConfig(max_move_km=10.0, drift=0.1).limits
-        {'max_move_km': 10.0, 'max_turn_deg': 90.0, 'drift_km': 1.0}
+        >>> PlanetConfig(distance_range_km=(100.0, 200.0)).regions
+        {'distance_range_km': (100.0, 200.0), 'max_move_km': 50.0, 'max_latitude': 70}
     """
 
     eval_every: Count = 10
     learning_rate: Positive = 3e-4
     final_learning_rate: Positive = 1e-5
 
-    max_move_km: Positive = 50.0
-    """Longest leg [km]."""
-    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """Largest turn to either side before a leg [deg]."""
-    drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
     num_regions: Count = 1024
     """Number of training regions, two on each random planet."""
     distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a task [km]."""
     max_steps: Count = 50
     """Legs after which an episode is truncated."""
-    noise_exponent: Positive = 1.0
-    """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
     steps_per_batch: Count = 32
     """Steps of each vehicle in a collected batch."""
     epochs: Count = 8
@@ -192,30 +199,22 @@ class PlanetConfig(RunConfig):
     def _fits(self) -> Self:
         if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
             raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
-        if self.scenario is not None:
-            raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
         if self.distance_range_km[1] > LONGEST_KM:
             message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
             raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")
         return self
 
     @property
-    def limits(self) -> dict[str, float]:
-        """Options of the environment."""
-        drift_km = self.drift * self.max_move_km
-        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
+    def reach_km(self) -> float:
+        """Farthest that a leg takes a vehicle [km]."""
+        return 50.0
 
     @property
     def regions(self) -> dict[str, Any]:
         """Options of the regions: large enough for the longest task, and how the distances are drawn."""
         far = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
         size = far if self.distance_range_km[1] > 500 else {"max_latitude": 70}
-        reach_km = self.max_move_km + self.limits["drift_km"]
-        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
-
-    def motion(self, seed: int) -> list[Transform]:
-        """Return the errors of motion: the current, if there is one."""
-        return [MotionError(current_km_h=self.drift, speed_km_h=1.0, seed=seed)] if self.drift else []
+        return {"distance_range_km": self.distance_range_km, "max_move_km": self.reach_km, **size}
 
 
 Config = TypeVar("Config")
@@ -269,7 +268,7 @@ def parse(
         options: options of ``tyro.cli``.
 
     Example:
-        >>> parse(RunConfig, "mine.py", None, ["--noise=[0.05, 0.05, 5]"]).noise
+        >>> parse(RegionConfig, "mine.py", None, ["--noise=[0.05, 0.05, 5]"]).noise
         (0.05, 0.05, 5.0)
     """
     words = [part for word in (sys.argv[1:] if args is None else args) for part in _tyro_words(word)]

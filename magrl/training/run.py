@@ -33,8 +33,9 @@ from magrl.evaluation.episodes import episode_measures, evaluation_rollout, summ
 from magrl.evaluation.flight import Flight
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere
+from magrl.sensor_std import PERFECT, Noise
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
-from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RunConfig
+from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
 from magrl.training.loggers import open_log
 
@@ -119,10 +120,13 @@ class Run:
     ) -> None:
         self._began = time.perf_counter()
         self.config, self.recipe, self.losses = config, recipe, losses
-        self.scenario = config.load_scenario()
-        self.name = f"{name}-{config.scenario.stem}" if config.scenario else name
-        if any(config.noise):
-            self.name += "-noise-" + "-".join(f"{level:g}" for level in config.noise)
+        self.scenario, self._file = Scenario(), None
+        if isinstance(config, RegionConfig):
+            self.scenario, self._file = config.load_scenario(), config.scenario
+        self.noise: Noise = getattr(config, "noise", PERFECT.noise)
+        self.name = f"{name}-{self._file.stem}" if self._file else name
+        if any(self.noise):
+            self.name += "-noise-" + "-".join(f"{level:g}" for level in self.noise)
         if config.resume:  # its scenario file has another name there
             self.name = json.loads(read_text(config.resume / "config.json")).get("name", self.name)
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
@@ -140,14 +144,16 @@ class Run:
             exits.enter_context(locked(self.folder))
             if self.config.resume is None:
                 exits.push(self._discard)
-                if self.config.scenario:
-                    shutil.copyfile(self.config.scenario, self.folder / self.settings["scenario"])
+                if self._file:
+                    shutil.copyfile(self._file, self.folder / self.settings["scenario"])
                 write_json(self.folder / "config.json", self.settings)
             exits.enter_context(self.stop)
             self._exits = exits.pop_all()
         return self
 
     def __exit__(self, *error: Any) -> None:
+        if error[0] is KeyboardInterrupt and self.statistics.frames:
+            self._say_how_to_resume()
         self._exits.__exit__(*error)
 
     def _discard(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -159,8 +165,9 @@ class Run:
     def settings(self) -> dict[str, Any]:
         """Settings as ``config.json`` holds them: no path of this machine, and the names of recipe and run."""
         settings = {"recipe": self.recipe, "name": self.name} | self.config.model_dump(mode="json")
-        source = self.config.scenario
-        return settings | {"out": self.folder.name, "resume": None, "scenario": source and f"scenario{source.suffix}"}
+        if self._file:
+            settings["scenario"] = f"scenario{self._file.suffix}"
+        return settings | {"out": self.folder.name, "resume": None}
 
     def evaluation_envs(self, *transforms: Transform, **options: Any) -> tuple[EnvBase, EnvBase]:
         """Return the environments of the validation tasks and of the test tasks, with the sensor noise of the run.
@@ -171,7 +178,7 @@ class Run:
         """
 
         def make(scenario: Scenario, seed: int) -> EnvBase:
-            env = Flight(scenario, errors=self.config.noise, seed=seed, **options).env
+            env = Flight(scenario, errors=self.noise, seed=seed, **options).env
             task = Compose(*(transform.clone() for transform in transforms))
             return TransformedEnv(env, task, auto_unwrap=True) if transforms else env
 
@@ -187,7 +194,7 @@ class Run:
     def state_dict(self) -> dict[str, Any]:
         """Return the settings of the training, and the text of its scenario file."""
         state = {name: value for name, value in self.settings.items() if name not in CHANGEABLE}
-        return state | {"scenario": self.config.scenario and read_text(self.folder / state["scenario"])}
+        return state | ({"scenario": read_text(self.folder / state["scenario"])} if self._file else {})
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Raise a ValueError unless these are the settings of this training."""
@@ -346,10 +353,14 @@ class Run:
     def _report_stop(self) -> None:
         print(
             f"\nStopped after {self.statistics.frames} frames; "
-            f"the policy so far is {self.folder / 'policy.safetensors'}\nTo resume: --resume {self.folder}",
+            f"the policy so far is {self.folder / 'policy.safetensors'}",
             file=sys.stderr,
         )
+        self._say_how_to_resume()
         raise SystemExit(self.stop.exit_code)
+
+    def _say_how_to_resume(self) -> None:
+        print(f"To resume: --resume {self.folder}", file=sys.stderr)
 
     def _report(self, result: dict[str, float]) -> None:
         arrived = "no episode arrived"

@@ -92,7 +92,7 @@ def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:
         ({"start_heading": "\x1b[2J"}, r"start_heading must be .*, got '\\x1b\[2J'"),
     ):
         save_tensors(content | {"training": training}, path)
-        for read in (load_policy, lambda path: training_settings([f"td3={path}"])):
+        for read in (load_policy, lambda path: training_settings([f"{path}"])):
             with pytest.raises(ValueError, match=message) as error:
                 read(path)
             assert str(path) in str(error.value)

@@ -34,7 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
-    evaluate.main([f"gg_td3={run}", "secant", "pso", "--tasks", "4", "--max-steps", "3", "--out", str(out)])
+    evaluate.main([f"{run}", "secant", "pso", "--tasks", "4", "--max-steps", "3", "--out", str(out)])
     return out
 
 
@@ -51,14 +51,15 @@ def test_summary_is_that_of_the_episodes_of_the_same_tasks(results: Path) -> Non
     assert [r["shortest_km"] for r in ahead] == [r["shortest_km"] for r in secant]
     assert summary["secant"][0]["spl"] == pytest.approx(25 * sum(float(r["spl"]) for r in secant))
     assert summary["secant"][0]["field_readings"] == 0 < summary["pso"][0]["field_readings"]
-    assert summary["gg_td3"][0]["steps"] is None  # no success
+    assert summary["gg_td3_noise"][0]["steps"] is None  # no success
     assert [r["source"] for r in rows(results / "runs.csv")][:2] == ["noisy", ""]
 
 
 def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
     lines = (results / "table.md").read_text(encoding="utf-8").splitlines()
-    assert [line.split("|")[1].strip() for line in lines[2:4]] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
-    assert lines[2].split("|")[5:9] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
+    first, *_, published, _ = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:6]]
+    assert first[:3] == ["Gradient-Guided TD3, trained with noise", "the region", "nothing"]
+    assert [published[0], *published[4:8]] == ["PSO, paper", "29.0", "442495", "27.09", "21.03"]
     assert "Standard deviations of the noise on D, I and B_H: 0.05 deg, 0.05 deg, 5 nT." in lines
     assert (results / "trajectories.png").stat().st_size > 10_000
 
@@ -72,7 +73,7 @@ def test_paths_and_settings_state_what_was_flown(results: Path) -> None:
         assert (float(row["latitude"]), float(row["longitude"])) == (-2.0, 162.0)
         assert [float(row[name]) for name in ("D", "I", "B_H")] == state["field"][0].tolist()
     settings = json.loads((results / "settings.json").read_text(encoding="utf-8"))
-    assert settings["navigators"] == ["gg_td3=noisy", "secant", "pso"]
+    assert settings["navigators"] == ["gg_td3_noise=noisy", "secant", "pso"]
     expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
     assert settings.items() >= expected.items()
 
@@ -101,7 +102,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
         tmp_path / "run", GeomagneticNavEnv(own), scenario="scenario.toml", zeta=0.02, start_heading="random"
     )
     (run / "scenario.toml").write_text(OWN, encoding="utf-8")
-    names = (f"gg_td3={run}", "secant")
+    names = (f"{run}", "secant")
     evaluate.evaluate(evaluate.Config(names, **config, **options))
     settings = json.loads((out / "settings.json").read_text(encoding="utf-8"))
     assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 2}).items()
@@ -111,7 +112,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     assert "paper" not in text
     assert "Arrival: distance, within 25 km." in text
     for message, change in (
-        (r"gg_td3=.*trained where D is", {"tasks": "figure-4-1", "scenario": None}),
+        (r"run: .*trained where D is", {"tasks": "figure-4-1", "scenario": None}),
         ("--tasks figure-4-1 lies in the paper's region", {"tasks": "figure-4-1"}),
     ):
         with pytest.raises(UsageError, match=message):

@@ -1,5 +1,6 @@
 """Navigators by the texts that commands take: labels, needs, options, and trained agents of every kind."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,16 +11,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 
 from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.evaluation.navigators import (
-    NAVIGATOR_NAMES,
-    TRAINED,
-    check_distinct,
-    label,
-    make_navigator,
-    needs,
-    trained_on,
-    training_settings,
-)
+from magrl.evaluation.navigators import KINDS, check_distinct, make_navigator, named, training_settings
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import NAVIGATORS, Anywhere, policy_env
 from magrl.navigators.quasi_newton import probe_length
@@ -51,14 +43,42 @@ def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return trained(env, tmp_path_factory.mktemp("runs") / "run")
 
 
-def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv, run: Path) -> None:
-    assert NAVIGATOR_COLORS.keys() == NAVIGATOR_NAMES.keys() == {*TRAINED, *NAVIGATORS}
+def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv) -> None:
+    assert NAVIGATOR_COLORS.keys() == KINDS.keys() == {"gg_td3", "td3", *NAVIGATORS}
     assert len(set(NAVIGATOR_COLORS.values())) == len(NAVIGATOR_COLORS)
-    for name in NAVIGATOR_NAMES:
-        navigator = make_navigator(f"{name}={run}" if name in TRAINED else name, env)
-        assert navigator(policy_env(env, navigator).reset())["action"].shape == (2, 2)
-        assert NAVIGATOR_NAMES[name] in label(name)
-        assert needs(name) == getattr(navigator, "needs", needs(name))
+    for name, kind in KINDS.items():
+        assert kind.name == name
+        assert kind.label in kind.description
+        if name in NAVIGATORS:
+            navigator = make_navigator(name, env)
+            assert navigator(policy_env(env, navigator).reset())["action"].shape == (2, 2)
+
+
+def test_a_file_says_what_its_agent_is(env: GeomagneticNavEnv, tmp_path: Path) -> None:
+    """Its name in results, its label in tables, and what it was trained on; a label replaces the first two."""
+    save_policy(tmp_path / "pilot.safetensors", Anywhere())
+    region = "the region"
+    for settings, wanted in (
+        ({"guided": True}, ("gg_td3", "Gradient-Guided TD3", region)),
+        ({"guided": True, "noise": STD}, ("gg_td3_noise", "Gradient-Guided TD3, trained with noise", region)),
+        ({"guided": False}, ("td3", "TD3", region)),
+        ({"guided": False, "noise": STD}, ("td3_noise", "TD3, trained with noise", region)),
+        ({"guided": None}, ("run", "run", "tasks of its own")),
+        (None, ("anywhere", "anywhere (PPO)", "random planets")),
+    ):
+        path = tmp_path / "pilot.safetensors"
+        if settings:
+            shutil.rmtree(tmp_path / "run", ignore_errors=True)
+            path = trained(env, tmp_path / "run", **settings)
+        for text, names in ((f"{path}", wanted[:2]), (f"my agent={path}", ("my agent", "my agent"))):
+            kind, source, file = named(text)
+            assert (kind.name, kind.description, kind.trained_on, source) == (*names, wanted[2], path)
+            assert file.is_file()
+
+
+def test_a_path_may_have_the_sign_of_a_label(env: GeomagneticNavEnv, tmp_path: Path) -> None:
+    path = trained(env, tmp_path / "tau=0.1")
+    assert [named(text).source for text in (f"{path}", f"A={path}")] == [path, path]
 
 
 def test_navigators_are_made_for_their_environment_and_sensors(env: GeomagneticNavEnv) -> None:
@@ -75,31 +95,31 @@ def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv,
     """Its network may be none of the library: this one turns right and moves by 30 km."""
     view = ReadingView(keys=["elapsed_steps"], max_move_km=30.0, max_turn_rad=1.5)
     save_policy(tmp_path / "policy.onnx", network_file(tmp_path, 1, bias=20.0), view)
-    for text in (f"policy:right={tmp_path / 'policy.onnx'}", str(tmp_path / "policy.onnx"), f"policy={tmp_path}"):
+    for text in (f"right={tmp_path / 'policy.onnx'}", str(tmp_path / "policy.onnx"), f"{tmp_path}"):
         assert make_navigator(text, env)(env.reset())["action"].tolist() == [[30, 1.5]] * 2
-    assert isinstance(make_navigator(f"policy={run}", env), FieldPolicy)
-    assert [label(text) for text in ("policy:SAC", "policy", "runs/ppo.onnx")] == ["SAC", "own policy", "ppo"]
+    assert isinstance(make_navigator(f"{run}", env), FieldPolicy)
+    shutil.copy(tmp_path / "policy.onnx", tmp_path / "ppo.onnx")
+    labels = [named(f"{path}").kind.label for path in (tmp_path, tmp_path / "policy.onnx", tmp_path / "ppo.onnx")]
+    assert labels == [tmp_path.name, tmp_path.name, "ppo"]
 
 
 def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
-    for text in ("dowsing", "secant=runs/a", "secant:own", f"td3:own={run}"):
-        with pytest.raises(
-            ValueError, match=f"unknown navigator '{text}': choose from gg_td3=RUN, .*anywhere=RUN, .*kalman, anywhere"
-        ):
-            make_navigator(text, env)
-    for function in (label, needs, trained_on):
-        with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
-            function("dowsing")
     for text, error, message in (
-        ("gg_td3", ValueError, "gg_td3 needs the folder of a finished run: gg_td3=RUN"),
-        ("policy:SAC", ValueError, "policy needs the folder of a finished run or the file of a policy"),
-        (f"td3={tmp_path}", FileNotFoundError, "there is no policy file at"),
+        ("dowsing", ValueError, r"unknown navigator 'dowsing': choose from kalman, anywhere, .*, or \[LABEL=\]PATH"),
+        ("x" * 5000, ValueError, r"unknown navigator 'x{76}\.\.\.: choose"),
+        (f"td3={run}", ValueError, "the name td3 follows from a file: leave it out, or choose another label"),
+        (f"secant={run}", ValueError, "the name secant follows from a file"),
+        (f"{tmp_path}", FileNotFoundError, f"there is no policy file at {tmp_path}/policy.safetensors"),
+        ("A=b.onnx", FileNotFoundError, "there is no policy file at b.onnx"),
+        (f"A=b/{'x' * 5000}", FileNotFoundError, "there is no policy file at b/xxx"),
     ):
         with pytest.raises(error, match=message):
             make_navigator(text, env)
     elsewhere = GeomagneticNavEnv(Scenario(region=Region((40, 50), (0, 10)), objective_floors=None), seed=0)
-    with pytest.raises(ValueError, match=rf"td3={run}: .*trained"):
-        make_navigator(f"td3={run}", elsewhere)
+    with pytest.raises(ValueError, match=rf"^{run}: .*trained"):
+        make_navigator(f"{run}", elsewhere)
+    with pytest.raises(TypeError, match=rf"^{run} is trained and takes no options, got wings"):
+        make_navigator(f"{run}", env, wings=2)
 
 
 def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
@@ -117,12 +137,13 @@ def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment() ->
     assert episodes["spl"].mean() > 0.95
 
 
-def test_navigators_that_are_given_twice(run: Path) -> None:
-    check_distinct(["secant", "ga", f"td3={run}", "policy:A=a.safetensors", "policy:B=b.safetensors"])
+def test_navigators_that_are_given_twice(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
+    other = trained(env, tmp_path / "run", guided=False)
+    check_distinct(["secant", "ga", f"A={run}", f"A={other}", "anywhere", f"B={pretrained('anywhere')}"])
     for texts, message in (
         (("secant", "ga", "secant"), "^secant is given twice: the same episodes again are no spread"),
-        ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "^td3=.* is given twice"),
-        (("anywhere", f"anywhere={run}"), "has the name of the pretrained anywhere: write policy:LABEL="),
+        ((f"{run}", f"A={run / '..' / run.name}"), "^A=.* is given twice"),
+        (("anywhere", f"{pretrained('anywhere')}"), "has the name of another navigator, anywhere: write LABEL="),
     ):
         with pytest.raises(ValueError, match=message):
             check_distinct(texts)
@@ -131,17 +152,15 @@ def test_navigators_that_are_given_twice(run: Path) -> None:
 def test_settings_of_a_training_are_read_from_the_file_of_the_policy(env: GeomagneticNavEnv, tmp_path: Path) -> None:
     """An option overrides them, with a note; a scenario is the same by its content."""
     one, other = (trained(env, tmp_path / name, zeta=0.02, noise=STD, scenario="scenario.toml") for name in "ab")
-    plain, texts = trained(env, tmp_path / "c"), ["secant", f"gg_td3={one}", f"gg_td3_noise={other}"]
+    plain, texts = trained(env, tmp_path / "c"), ["secant", f"{one}", f"B={other}"]
     settings = {"zeta": 0.02, "errors": STD, "scenario": one / "scenario.toml"}
     assert training_settings(texts, zeta=None) == (settings, [])
-    note = f"zeta is 0.5, in training 0.02 (gg_td3={one}), 0.02 (gg_td3_noise={other})"
+    note = f"zeta is 0.5, in training 0.02 ({one}), 0.02 (B={other})"
     assert training_settings(texts, zeta=0.5) == (settings | {"zeta": 0.5}, [note])
-    with pytest.raises(ValueError, match=r"trained with different scenario, .* \(gg_td3=.*c\): choose with --scenario"):
-        training_settings([*texts, f"gg_td3={plain}"])
-    with pytest.raises(ValueError, match=rf"{plain} was trained as gg_td3, not td3: write gg_td3={plain}"):
-        training_settings([f"td3={plain}"])
+    with pytest.raises(ValueError, match=r"trained with different scenario, .* \(.*c\): choose with --scenario"):
+        training_settings([*texts, f"{plain}"])
     save_policy(tmp_path / "pilot.safetensors", Anywhere(zeta=0.03))
-    assert training_settings([f"anywhere={tmp_path / 'pilot.safetensors'}"]) == ({"zeta": 0.03}, [])
+    assert training_settings([f"{tmp_path / 'pilot.safetensors'}"]) == ({"zeta": 0.03}, [])
 
 
 def test_a_policy_file_without_settings_of_a_training_is_loaded() -> None:

@@ -21,6 +21,7 @@ from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.navigation import NAMED_ENVS, navigation_env
 from magrl.evaluation.scores import SEED, scored
 from magrl.navigators import Secant
+from magrl.registry import NAMED_TASKS
 
 
 class Toward(nn.Module):
@@ -78,6 +79,43 @@ def test_all_kinds_of_an_agent_have_the_same_score(wanted: dict[str, float], tmp
 
 def test_a_navigator_has_the_score_of_its_name() -> None:
     assert score("secant", "nogo", episodes=4) == score(Secant(), "nogo", episodes=4)
+
+
+def test_a_task_is_given_by_its_name_or_its_id() -> None:
+    name, scores = NAMED_TASKS["nogo"].id, score("secant", "nogo", episodes=2, max_steps=2)
+    assert score("secant", name, episodes=2, max_steps=2) == pytest.approx(scores, nan_ok=True)
+    assert GeomagneticNavVectorEnv(2, task=name).single_observation_space.shape == (22,)
+    with pytest.raises(ValueError, match=r"task must be one of 'box', .*, got 'magrl/GeomagneticNavigationNoGo-v9'"):
+        score("secant", name.replace("v0", "v9"))
+
+
+def test_a_state_is_passed_to_every_function_that_has_one() -> None:
+    """Also where it has a default; another argument with a default is none."""
+
+    def default(observations: np.ndarray, state: int | None = None) -> tuple[np.ndarray, int]:
+        return with_state(observations, state)
+
+    def scaled(observations: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        return scale * toward(observations)
+
+    assert score(default, **BOX) == score(with_state, **BOX)
+    assert score(scaled, **BOX) == score(toward, **BOX)
+
+
+def test_what_is_no_agent_or_no_evaluation_is_refused() -> None:
+    for agent, options, message in (
+        (lambda *seen: seen[0], {}, r"act\(observations\) or act\(observations, state\), got .*: name its arguments"),
+        (dict, {}, "agent must be an object, got the class dict"),
+        (Predicting, {}, "agent must be an object, got the class Predicting"),
+        (nn.Linear(13, 2).double(), {}, r"float32 weights, as observations are, got torch.float64: .float\(\)"),
+        (nn.Linear(13, 2).bfloat16(), {}, "got torch.bfloat16"),
+        ("x" * 5000, {}, "unknown navigator"),
+        (Path("x" * 5000) / "y", {}, "there is no policy file"),
+        ("secant", {"episodes": 0}, "^episodes must be a whole number from 1 on, got 0"),
+        ("secant", {"seed": None}, "^seed must be a whole number from 0 on, got None"),
+    ):
+        with pytest.raises((TypeError, ValueError, OSError), match=message):
+            score(agent, **BOX | options)
 
 
 def test_the_episodes_are_those_of_the_seed_in_gymnasium(wanted: dict[str, float]) -> None:

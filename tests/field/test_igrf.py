@@ -16,6 +16,7 @@ import torch
 from support.field_checks import f64, globe
 
 import magrl.field
+from magrl.envs import Scenario
 from magrl.field import WMMHR, FieldBank, RegionalField, SphericalHarmonicField, wmmhr_coefficients
 from magrl.field.igrf import IGRF, igrf_coefficients, parse_date
 from magrl.field.wmmhr import WMMHR_SHA256
@@ -158,3 +159,11 @@ def test_expansions_of_wmmhr(wmmhr) -> None:
     gauss, zero = wmmhr_coefficients(2029.5).unsqueeze(0), torch.zeros(1, dtype=torch.int64)
     bank = FieldBank.build(gauss, zero, *edges, degree=24)
     assert (bank(latitude, longitude, zero) - value).abs().max() < 1e-4
+
+
+def test_a_date_of_another_generation_names_it() -> None:
+    for make in (lambda: IGRF("2026-07-01", generation=13), lambda: Scenario(date="2026-07-01")):
+        with pytest.raises(ValueError, match=r"outside IGRF-13, .* to 2025-01-01: generation=14 is valid then$"):
+            make()
+    with pytest.raises(ValueError, match=r"to 2030-01-01$"):
+        IGRF("2040-01-01")

@@ -27,9 +27,10 @@ from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.envs.navigation import NAMED_ENVS
+from magrl.registry import NAMED_TASKS
 from magrl.transforms import CONDITIONS
 
-flights, publish = load("docs/tables/flights"), load("docs/tables/publish")
+bars, flights, publish = (load(f"docs/tables/{name}") for name in ("bars", "flights", "publish"))
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
@@ -260,12 +261,12 @@ def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> Non
     scores, page = (ROOT / "docs/results/scores.md").read_text(encoding="utf-8"), TEXTS[ROOT / "README.md"]
     for name, (*_, spl, earned, trained) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
         task = name.split("-")[0].lower() or "box"
-        agent = "secant, least turn around the areas in sight" if task == "nogo" else "kalman"
+        agent = bars.BARS[NAMED_TASKS[task].reference]
         assert re.search(rf"^\| {task} \| {re.escape(agent)} \|.*\| {earned} \|.*\| {spl} \|$", scores, re.MULTILINE), (
             name
         )
         threshold = gymnasium.spec(f"magrl/GeomagneticNavigation{name}").reward_threshold
-        assert task == "nogo" or float(earned) == threshold, name
+        assert NAMED_TASKS[task].reference != "kalman" or float(earned) == threshold, name
         runs = re.findall(rf"^\| {task} \| (\S+) \| \d.*\| ([\d.]+)(?: \(\S+\))? \|$", scores, re.MULTILINE)
         assert trained == " ".join(max(runs, key=lambda run: float(run[1])))
 
@@ -281,13 +282,33 @@ def test_vehicles_of_the_readme_have_the_intervals_of_their_episodes() -> None:
             assert cell == " / ".join(shares), (navigator, level)
 
 
-@pytest.mark.parametrize(("task", "first"), [("Box", 0), ("Anywhere", 0), ("Readings", 0), ("NoGo", 13)])
-def test_observations_of_the_named_tasks_are_listed_by_index(task: str, first: int, monkeypatch) -> None:
+@pytest.mark.parametrize("name", NAMED_TASKS)
+def test_a_named_task_is_a_function_a_row_and_a_section(name: str, monkeypatch) -> None:
+    """The page has its id, steps and arrival, and lists its observation by index, or names the task with the same."""
     monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
-    listed = rows(f"## {task}\n", "index", TEXTS[ROOT / "docs/tasks.md"])
+    task, page = NAMED_TASKS[name], TEXTS[ROOT / "docs/tasks.md"]
+    env, table = NAMED_ENVS[name](seed=0), rows("# Named tasks", "id, after `magrl/GeomagneticNavigation`", page)
+    (row,) = [row for cell, row in table.items() if cell.endswith(f"(#{name})" + " (*Box*)" * (name == "box"))]
+    arrival = "within 25 km" if env.arrival.rule == "distance" else "F < 0.01"
+    assert row[:3] == [f"`{task.make}`", str(env.max_steps), arrival]
+    assert f"[`{task.id.removeprefix('magrl/GeomagneticNavigation')}`](#{name})" in page
+    assert gymnasium.spec(task.id).reward_threshold == task.threshold
+    text = page.partition(f"\n## {task.title}\n\n")[2].partition("\n## ")[0]
+    listed = re.findall(r"^\| (\d[\d–, ]*) \|", text, re.MULTILINE)
     ends = [[int(end) for end in part.split("–")] for row in listed for part in row.split(", ")]
-    size = NAMED_ENVS[task.lower()](seed=0).observation_spec["observation"].shape[-1]
-    assert list(chain(*(range(part[0], part[-1] + 1) for part in ends))) == list(range(first, size))
+    sizes = range(13 if task.transforms else 0, env.observation_spec["observation"].shape[-1])
+    assert list(chain(*(range(part[0], part[-1] + 1) for part in ends))) == list(sizes) or text.startswith("*Readings*")
+
+
+def test_no_code_lists_the_named_tasks_again() -> None:
+    """Three of them in one literal are a list; what a recipe trains on are two."""
+    found = []
+    for path in (*ROOT.glob("magrl/**/*.py"), *ROOT.glob("recipes/*.py"), *ROOT.glob("docs/tables/*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            parts = [*getattr(node, "keys", []), *getattr(node, "elts", [])]
+            names = {str(part.value).split("-")[0].lower() for part in parts if isinstance(part, ast.Constant)}
+            found += [f"{path.name}: {ast.unparse(node)}"] * (len(names & {*NAMED_TASKS}) > 2)
+    assert found == []
 
 
 def test_presets_and_their_speeds() -> None:

@@ -160,7 +160,7 @@ def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -
 def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:
     for seed in (10, 2):
         (tmp_path / f"a-seed{seed}").mkdir()
-    assert flights.runs_of(f"td3={tmp_path}/a-seed*") == [f"td3={tmp_path}/a-seed{seed}" for seed in (2, 10)]
+    assert flights.runs_of(f"A={tmp_path}/a-seed*") == [f"A={tmp_path}/a-seed{seed}" for seed in (2, 10)]
     ends = {"success": torch.tensor([True]), "steps": torch.tensor([10]), "path_efficiency": torch.ones(1)}
     ends |= {"length_km": torch.ones(1), "navigation_error_km": torch.ones(1)}
     ends |= dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.zeros(1))

@@ -16,7 +16,7 @@ from magrl.transforms.areas import NUMBER
 DOCS = ROOT / "docs"
 DRAWN = figures.DATA | {"results/scores": "results/scores.csv"}
 OTHERS = {"fig-4-1-contours", "two-elements"}  # of the field alone
-OTHERS |= {"place-error", "reliability", *(f"task-{task}" for task in pictures.NAMED_ENVS)}  # flights
+OTHERS |= {"place-error", "reliability", *(f"task-{task}" for task in pictures.NAMED_TASKS)}  # flights
 OTHERS |= {"plume", "cost-by-vehicles"}  # a training, a benchmark
 
 
@@ -70,5 +70,5 @@ def test_pictures_are_small_enough_for_a_first_screen() -> None:
         assert picture.width == 720
     assert 10 < seconds < 14
     assert animation.stat().st_size < 1_500_000
-    for task in pictures.NAMED_ENVS:
+    for task in pictures.NAMED_TASKS:
         assert (DOCS / "figures" / f"task-{task}.png").stat().st_size < 40_000

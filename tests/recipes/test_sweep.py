@@ -35,8 +35,8 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     monkeypatch.setattr(sweep, "score", partial(score, max_steps=2))
     chosen = sweep.ALGORITHMS[name]
     settings = chosen.settings | {"n_steps": 2, "batch_size": 16}
-    few = chosen._replace(num_envs=8, thousands={task: 0.032}, settings=settings)
-    monkeypatch.setitem(sweep.ALGORITHMS, name, few)
+    monkeypatch.setitem(sweep.ALGORITHMS, name, chosen._replace(num_envs=8, settings=settings))
+    monkeypatch.setitem(sweep.NAMED_TASKS, task, sweep.NAMED_TASKS[task]._replace(budget={name: 0.032}))
     job = (sweep.Config(out=tmp_path), task, name, 0)
     rows = read_csv(sweep.run(*job))
     assert rows["steps"].tolist() == [8, 16, 32, 32]
@@ -61,7 +61,7 @@ def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
     for results, options, message in (
         ("new/folder", [], "none of the algorithms"),
         ("file/folder", [], "cannot write"),
-        ("new", ["--tasks", "mars"], "unknown task"),
+        ("new", ["--tasks", "mars"], "task must be one of .*, got 'mars'"),
     ):
         with pytest.raises((UsageError, OSError), match=message):
             sweep.main(["--no-train", "--out", str(tmp_path / "runs"), "--results", str(tmp_path / results), *options])
@@ -71,11 +71,9 @@ def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
 
 
 def test_a_recipe_that_fails_says_why(tmp_path: Path, monkeypatch) -> None:
-    assert all(
-        (ROOT / "recipes" / script).is_file() for tasks in sweep.RECIPES.values() for script, *_ in tasks.values()
-    )
+    assert all((ROOT / "recipes" / script).is_file() for script, *_ in sweep.RECIPES.values())
     (tmp_path / "fails.py").write_text("raise SystemExit('no power')", encoding="utf-8")
-    monkeypatch.setitem(sweep.RECIPES, "GG-TD3", {"box": (str(tmp_path / "fails.py"),)})
+    monkeypatch.setitem(sweep.RECIPES, "GG-TD3", (str(tmp_path / "fails.py"),))
     with pytest.raises(UsageError, match=r"fails\.py ended with status 1: no power"):
         sweep.recipe("box", "GG-TD3", 0, tmp_path)
 

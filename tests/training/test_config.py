@@ -11,7 +11,7 @@ import pytest
 import td3_gradient_guided as recipe
 
 from magrl import paper
-from magrl.training import RunConfig, UsageError, command, parse_config
+from magrl.training import RegionConfig, UsageError, command, parse_config
 
 ROOT = Path(__file__).parent.parent.parent
 OWN = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
@@ -33,7 +33,7 @@ def test_bad_settings_of_a_run(tmp_path: Path) -> None:
         ({"speed": 1}, "unknown key 'speed'"),
     ):
         with pytest.raises(ValueError, match=message):
-            RunConfig(**bad)
+            RegionConfig(**bad)
     path = tmp_path / "mine.toml"
     for text, message in (
         (OWN + "zeta = 0.02\n", r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"),
@@ -42,7 +42,7 @@ def test_bad_settings_of_a_run(tmp_path: Path) -> None:
     ):
         path.write_text(text, encoding="utf-8")
         with pytest.raises(ValueError, match=message):
-            RunConfig(scenario=path)
+            RegionConfig(scenario=path)
 
 
 def test_linear_goes_from_start_to_end() -> None:

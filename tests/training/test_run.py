@@ -16,7 +16,7 @@ from torchrl.collectors import Collector
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import locked
-from magrl.training import Run, RunConfig, UsageError, command, curves, run
+from magrl.training import RegionConfig, Run, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints
 from magrl.training.config import CHANGEABLE, resumed_config
 from magrl.training.curves import TrainingStatistics
@@ -27,14 +27,14 @@ AZORES = ROOT / "docs" / "examples" / "azores.toml"
 NOISE = (0.05, 0.05, 5.0)
 
 
-def in_run(config: RunConfig) -> Run:
+def in_run(config: RegionConfig) -> Run:
     return Run(config, recipe="mine.py", name="mine")
 
 
 def train(folder: Path, width: int = 1, **options: object) -> None:
     """A training whose agent flies at random and learns nothing."""
     options = {"total_frames": 12, "eval_every": 2, "log_every": 2, "eval_tasks_small": 2, "eval_tasks": 2} | options
-    with in_run(RunConfig(out=folder, wandb_mode="disabled", **options)) as run:
+    with in_run(RegionConfig(out=folder, wandb_mode="disabled", **options)) as run:
         torch.manual_seed(run.config.seed)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=2, seed=0, max_steps=2)
         validation, test = run.evaluation_envs(max_steps=2, zeta=2.9)
@@ -50,7 +50,7 @@ def train(folder: Path, width: int = 1, **options: object) -> None:
 
 
 def test_config_and_scenario_are_written_with_the_folder(tmp_path: Path) -> None:
-    config = RunConfig(out=tmp_path / "run", seed=4, wandb_mode="disabled", scenario=AZORES)
+    config = RegionConfig(out=tmp_path / "run", seed=4, wandb_mode="disabled", scenario=AZORES)
     with in_run(config) as run:
         assert {path.name for path in run.folder.iterdir()} == {".lock", "config.json", "scenario.toml"}
         written = json.loads((run.folder / "config.json").read_text(encoding="utf-8"))
@@ -61,12 +61,12 @@ def test_config_and_scenario_are_written_with_the_folder(tmp_path: Path) -> None
             pass
     with locked(run.folder):
         pass
-    assert in_run(resumed_config(run.folder, RunConfig, "mine.py")).name == run.name == "mine-azores"
+    assert in_run(resumed_config(run.folder, RegionConfig, "mine.py")).name == run.name == "mine-azores"
 
 
 def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path) -> None:
     """So the same command can be given again; what was collected, another's folder and a resumed run stay."""
-    config = RunConfig(out=tmp_path / "run")
+    config = RegionConfig(out=tmp_path / "run")
     with pytest.raises(MemoryError), in_run(config):
         raise MemoryError
     assert not (tmp_path / "run").exists()
@@ -85,13 +85,13 @@ def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path) -> None:
 
 def test_run_is_named_after_its_scenario_and_noise() -> None:
     for options, name in (({}, "mine"), ({"scenario": AZORES, "noise": (0.05, 0, 1)}, "mine-azores-noise-0.05-0-1")):
-        run = in_run(RunConfig(seed=2, **options))
+        run = in_run(RegionConfig(seed=2, **options))
         assert (run.name, run.folder) == (name, Path("runs") / f"{name}-seed2")
 
 
 def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
     for noise, share in ((NOISE, 1.0), ((0.0, 0.0, 0.0), 0.0)):
-        with in_run(RunConfig(out=tmp_path / f"run{share}", noise=noise, eval_tasks=6, eval_tasks_small=4)) as run:
+        with in_run(RegionConfig(out=tmp_path / f"run{share}", noise=noise, eval_tasks=6, eval_tasks_small=4)) as run:
             states = [env.reset() for env in run.evaluation_envs(zeta=0.01)]
         errors = [state["field"] - state.get("true_field", state["field"]) for state in states]
         assert [(error != 0).double().mean().item() for error in errors] == [share, share]
@@ -151,6 +151,14 @@ def test_training_seconds_count_from_the_start_of_the_run(tmp_path: Path, signal
         assert [row["seconds"] for row in csv.DictReader(file)] == ["100", "200", "200"]
 
 
+@pytest.mark.usefixtures("without_figures")
+def test_a_second_ctrl_c_says_how_to_resume(tmp_path: Path, signalled, capsys) -> None:
+    """It ends the training at once, without a new checkpoint."""
+    with signalled(3, signal.SIGINT), signalled(3, signal.SIGINT), pytest.raises(KeyboardInterrupt):
+        train(tmp_path)
+    assert f"To resume: --resume {tmp_path}\n" in capsys.readouterr().err
+
+
 @pytest.mark.filterwarnings("ignore:.*trying the previous checkpoint")
 @pytest.mark.usefixtures("without_figures")
 def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> None:
@@ -179,7 +187,7 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
     other |= {"scenario": text}
     other |= {name: value * 2 + 1 for name, value in written.items() if name not in other and name not in CHANGEABLE}
     assert len(other) == len(written) - len(CHANGEABLE)
-    with in_run(resumed_config(tmp_path, RunConfig, "mine.py")) as resumed:
+    with in_run(resumed_config(tmp_path, RegionConfig, "mine.py")) as resumed:
         saved = resumed.state_dict()
     for name, value in other.items():
         before = saved | {name: value if name != "scenario" else text + "# edited"}
