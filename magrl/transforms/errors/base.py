@@ -8,12 +8,12 @@ and a transform holds no state.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
@@ -39,7 +39,7 @@ DISPLACEMENT = "displacement"
 class Episode(NamedTuple):
     """State of an episode at a reading: its numbers, the stream of random numbers, and whether it begins here."""
 
-    numbers: Any  # a tensor, or a TensorDict
+    numbers: Tensor
     stream: Tensor
     first: bool
 
@@ -69,13 +69,11 @@ class EpisodeNumbers(StatefulTransform):
     channel: ClassVar[int] = 0
     """Second counter: it separates the numbers of a class from others of the same seed."""
     numbers_key: NestedKey
-    """Key of the numbers of an episode ``(..., size)``, or of a record of them."""
+    """Key of the numbers of an episode ``(..., size)``."""
     stream_key: ClassVar[str]
     """Key of the state of the random numbers ``(..., 1)``, int64. Privileged."""
     size: int
     """Numbers of an episode."""
-    entries: Mapping[str, int] | None = None
-    """Numbers of each entry of a record by its name, instead of ``size``."""
     numbers_dtype: ClassVar[torch.dtype | None] = None
     """Type of these numbers; by default the first value's."""
     draws = 0
@@ -95,11 +93,11 @@ class EpisodeNumbers(StatefulTransform):
         """Keys that a step reads from the TensorDict before it."""
         return [self.numbers_key, self.stream_key]
 
-    def _constants(self, stream: Tensor) -> Tensor | TensorDict:
-        """Return the numbers of new episodes ``(..., size)``, or a record of them."""
+    def _constants(self, stream: Tensor) -> Tensor:
+        """Return the numbers of new episodes ``(..., size)``."""
         raise NotImplementedError
 
-    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor | TensorDict:
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         """Write what the numbers change in the values at ``in_keys``; return the numbers of the next step."""
         raise NotImplementedError
 
@@ -129,9 +127,7 @@ class EpisodeNumbers(StatefulTransform):
         """Check the shapes that are read, and add what is written, the numbers and the state of the random ones."""
         observation_spec = super().transform_observation_spec(observation_spec)
         leaf = self._leaf(observation_spec, self.in_keys[0])
-        entries = {(): self.size} if self.entries is None else self.entries
-        for name, size in entries.items():
-            self._add(observation_spec, leaf, unravel_key((self.numbers_key, name)), size, dtype=self.numbers_dtype)
+        self._add(observation_spec, leaf, self.numbers_key, self.size, dtype=self.numbers_dtype)
         self._add(observation_spec, leaf, self.stream_key, 1, dtype=torch.int64)
         return observation_spec
 
