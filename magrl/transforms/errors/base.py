@@ -8,8 +8,9 @@ and a transform holds no state.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Mapping, Sequence
+from inspect import Parameter, signature
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -23,6 +24,7 @@ from magrl.geodesy import wrap_longitude
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms.base import Keys, StatefulTransform
 
+T = TypeVar("T")
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which accuracy is stated where errors depend on the field.
 
@@ -143,6 +145,22 @@ class EpisodeErrors(EpisodeNumbers):
     true_keys: ClassVar[tuple[str, ...]] = ()
     """Keys of true values."""
 
+    @classmethod
+    def from_options(cls, options: Any, speed_km_h: float, seed: int = 0) -> EpisodeErrors:
+        """Return the error of a vehicle with the options that a file states.
+
+        Args:
+            options: options of the class by name.
+            speed_km_h: speed of the vehicle [km/h], for a class that has this argument.
+            seed: seed of the errors.
+
+        Raises:
+            ValueError: for an option that the class does not have, or one out of its range.
+            TypeError: for an option that is missing, or one of another type.
+        """
+        speed = {"speed_km_h": speed_km_h} if "speed_km_h" in signature(cls).parameters else {}
+        return build(cls, options, **speed, seed=seed)
+
     def accuracy(self, field: Tensor) -> SensorStd:
         """Return the standard deviations that the errors add to a reading, each ``(..., E)``.
 
@@ -192,8 +210,9 @@ class ReadingErrors(EpisodeErrors):
         in_keys: of the transform.
         out_keys: of the transform.
         seed: seed of the errors.
-        stated: accuracy that the vehicle knows; by default the accuracy of the errors:
-            :data:`magrl.sensor_std.PERFECT` for errors that no data sheet states.
+        stated: accuracy that the vehicle knows, or the fields of :class:`~magrl.sensor_std.SensorStd` by name; by
+            default the accuracy of the errors. Errors that no data sheet states have
+            :data:`magrl.sensor_std.PERFECT`, or no fields.
 
     :meth:`_disturb` returns the numbers of the next step, so that a drift keeps its value. :meth:`accuracy` knows no
     time: of an error that grows, it is the mean over an episode.
@@ -229,9 +248,9 @@ class ReadingErrors(EpisodeErrors):
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
     _accuracy: Tensor
 
-    def __init__(self, *keys: Keys | None, stated: SensorStd | None = None, **options: Any) -> None:
+    def __init__(self, *keys: Keys | None, stated: SensorStd | Mapping[str, Any] | None = None, **options: Any) -> None:
         super().__init__(*keys, **options)
-        self.stated = stated
+        self.stated = build(SensorStd, stated) if isinstance(stated, Mapping) else stated
 
     def _set_accuracy(self) -> None:
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""
@@ -269,6 +288,31 @@ def _folded(elements: Tensor) -> Tensor:
     declination, inclination, horizontal = elements.unbind(-1)
     folded = wrap_longitude(declination + 180), torch.sign(inclination) * 180 - inclination, horizontal
     return torch.where(inclination.abs().unsqueeze(-1) > 90, torch.stack(folded, -1), elements)
+
+
+def build(kind: type[T], options: Any, **given: Any) -> T:
+    """Return an object of a class with the options that a file states, and those that a program gives.
+
+    Raises:
+        ValueError: for an option that the class does not have, with those that a file may state.
+        TypeError: for options that have no names.
+
+    Example:
+        >>> build(SensorStd, {"noice": [1.0, 1.0, 5.0]})
+        Traceback (most recent call last):
+        ValueError: SensorStd has no option 'noice': choose from noise, bias, drift, iron
+    """
+    if not isinstance(options, Mapping):
+        raise TypeError(f"{kind.__name__} needs options by name, got {options!r}")
+    kinds = [base for base in kind.__mro__ if base is kind or issubclass(base, EpisodeErrors)]
+    arguments = [argument for base in kinds for argument in signature(base).parameters.values()]
+    variadic = Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD
+    names = dict.fromkeys(one.name for one in arguments if one.kind not in variadic)
+    allowed = [name for name in names if name not in ("in_keys", "out_keys", "seed", "speed_km_h")]
+    for name in options:
+        if name not in allowed:
+            raise ValueError(f"{kind.__name__} has no option {name!r}: choose from {', '.join(allowed)}")
+    return kind(**options, **given)
 
 
 def check_sizes(count: int | None = None, *, fixed: bool = False, **sizes: Sequence[float]) -> None:

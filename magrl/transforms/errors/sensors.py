@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.counters import normal_of, stream_uniform
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
+from magrl.transforms.errors.base import Episode, ReadingErrors, build, check_sizes, gauss_markov
 from magrl.transforms.errors.vector import VectorErrors
 
 LEVEL_DRAWS = 12
@@ -45,7 +45,8 @@ class SensorErrors(ReadingErrors):
         drift_length: its correlation length [unit of the distance of a leg, or steps].
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
         outage_rate: probability that a reading is missing; never the first of an episode.
-        vector: errors of a vector magnetometer, where the elements are D, I, B_H.
+        vector: errors of a vector magnetometer, where the elements are D, I, B_H; or the options of
+            :class:`~magrl.transforms.VectorErrors` by name.
         fixed: whether bias and scale are the errors themselves, in every episode.
         levels: function of uniform numbers ``(..., 12)`` in [0, 1), which returns further standard deviations
             ``(..., 2 E)`` for each vehicle and episode, such as :func:`~magrl.transforms.sensor_levels`: of white
@@ -89,7 +90,7 @@ class SensorErrors(ReadingErrors):
         drift_length: float = DRIFT_KM,
         resolution: Sequence[float] | None = None,
         outage_rate: float = 0.0,
-        vector: VectorErrors | None = None,
+        vector: VectorErrors | Mapping[str, Any] | None = None,
         fixed: bool = False,
         levels: Callable[[Tensor], Tensor] | None = None,
         **options: Any,
@@ -109,6 +110,7 @@ class SensorErrors(ReadingErrors):
         check_number(0, above=True, drift_length=drift_length)
         if levels is not None and not callable(levels):
             raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
+        vector = build(VectorErrors, vector) if isinstance(vector, Mapping) else vector
         if vector is not None:
             check_type(VectorErrors, vector=vector)
             if "heading" not in self.in_names:
@@ -118,13 +120,17 @@ class SensorErrors(ReadingErrors):
         self.drift_length, self.outage_rate, self.vector = float(drift_length), float(outage_rate), vector
         self.fixed, self.levels, self.in_sizes = fixed, levels, {"field": (self.count,), "heading": (1,)}
         self.level_draws = LEVEL_DRAWS + 1 + self.count if levels else 0
-        parts = dict.fromkeys(("drift", "reading", "bias", "scale"), self.count)
-        parts |= {"vector": vector.size} if vector else {}
-        self.layout = parts | (dict.fromkeys(LEVELS, self.count) if levels else {})
+        self.layout = self._layout()
         self.size = sum(self.layout.values())
         self.draws = self.level_draws + 2 * self.count + (vector.draws if vector else 0)
         self.step_draws = 2 * self.count + 1
         self._set_accuracy()
+
+    def _layout(self) -> dict[str, int]:
+        """Return how many numbers of an episode each part has, in their order."""
+        parts = dict.fromkeys(("drift", "reading", "bias", "scale"), self.count)
+        parts |= {"vector": self.vector.size} if self.vector else {}
+        return parts | (dict.fromkeys(LEVELS, self.count) if self.levels else {})
 
     def named(self, numbers: Tensor) -> dict[str, Tensor]:
         """Return the errors of an episode by name, from the value ``(..., size)`` at ``sensor_error``.
