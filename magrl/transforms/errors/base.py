@@ -103,10 +103,18 @@ class EpisodeNumbers(StatefulTransform):
         """Write what the numbers change in the values at ``in_keys``; return the numbers of the next step."""
         raise NotImplementedError
 
-    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
         stream = self._episode_stream(tensordict, values[0].device)
-        numbers = self._constants(stream).to(self.numbers_dtype or values[0].dtype)
+        numbers = self._begun(stream, mask).to(self.numbers_dtype or values[0].dtype)
         self._write(tensordict, values, Episode(numbers, advanced(stream, self.draws), first=True))
+
+    def _begun(self, stream: Tensor, mask: Tensor | None) -> Tensor:
+        """Return the numbers of new episodes ``(..., size)``, and 0 in rows whose episode goes on."""
+        if mask is None or mask.device.type != "cpu":  # an accelerator would wait for the number of rows
+            return self._constants(stream)
+        begun = mask.reshape(stream.shape)
+        drawn = self._constants(stream[begun])
+        return drawn.new_zeros(*stream.shape, self.size).masked_scatter(begun.unsqueeze(-1), drawn)
 
     def _episode_stream(self, tensordict: TensorDictBase, device: torch.device) -> Tensor:
         """Return the stream of the episode in each row, ``(...)``."""
@@ -246,6 +254,8 @@ class ReadingErrors(EpisodeErrors):
 
     default_out_keys: ClassVar[Keys] = ("field",)
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
+    changes_inclination: ClassVar[bool] = True
+    """Whether the error may carry I beyond the vertical."""
     _accuracy: Tensor
 
     def __init__(self, *keys: Keys | None, stated: SensorStd | Mapping[str, Any] | None = None, **options: Any) -> None:
@@ -265,7 +275,8 @@ class ReadingErrors(EpisodeErrors):
         """Write a reading, its true value and its accuracy, if that is not always the same."""
         if tensordict.get(self.true_keys[0], None) is None:
             tensordict.set(self.true_keys[0], value)
-        self._write_named(tensordict, field=_folded(reading) if reading.shape[-1] == 3 else reading)
+        folds = self.changes_inclination and reading.shape[-1] == 3
+        self._write_named(tensordict, field=_folded(reading) if folds else reading)
         accuracy = SensorStd(*self._accuracy.to(reading.dtype)) if accuracy is None else accuracy
         accuracy = accuracy if self.stated is None else SensorStd(*reading.new_tensor(self.stated))
         for key, std in zip(STD_KEYS, accuracy, strict=True):

@@ -88,7 +88,7 @@ class NorthReferenceError(ReadingErrors):
         (tensor([[-2.]]), tensor(-2.))
     """
 
-    channel = 3
+    channel, changes_inclination = 3, False
     true_keys = ("true_field", "true_heading")
     default_in_keys = ("heading", "field", "move")
     default_out_keys = ("heading", "field")
