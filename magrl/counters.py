@@ -64,8 +64,8 @@ def counter_stream(seed: int, counters: Tensor) -> Tensor:
     if not isinstance(counters, Tensor) or counters.dtype != torch.int64 or not counters.ndim:
         raise ValueError(f"counters must be int64 of shape (..., C), got {counters!r}")
     key = _mix(torch.full(counters.shape[:-1], _signed(seed), dtype=torch.int64, device=counters.device))
-    for counter in counters.unbind(-1):
-        key = _mix(key ^ _mix(counter + _GOLDEN))
+    for mixed in _mix(counters + _GOLDEN).unbind(-1):
+        key = _mix(key ^ mixed)
     return key
 
 
@@ -128,11 +128,11 @@ _GOLDEN = _signed(0x9E3779B97F4A7C15)  # the step of SplitMix64
 
 
 def _shift(value: Tensor, bits: int) -> Tensor:
-    """Return a logical right shift, which int64 lacks."""
-    return (value >> bits) & ((1 << (64 - bits)) - 1)
+    """Return a logical right shift, which int64 lacks, as a new tensor."""
+    return (value >> bits).bitwise_and_((1 << (64 - bits)) - 1)
 
 
 def _mix(value: Tensor) -> Tensor:
-    value = (value ^ _shift(value, 30)) * _signed(0xBF58476D1CE4E5B9)
-    value = (value ^ _shift(value, 27)) * _signed(0x94D049BB133111EB)
-    return value ^ _shift(value, 31)
+    value = _shift(value, 30).bitwise_xor_(value).mul_(_signed(0xBF58476D1CE4E5B9))
+    value = _shift(value, 27).bitwise_xor_(value).mul_(_signed(0x94D049BB133111EB))
+    return _shift(value, 31).bitwise_xor_(value)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -96,7 +95,7 @@ def trips() -> tuple[Tensor, dict[str, tuple[Trip, int]]]:
     scenario = earth_scenario(64, seed=0, distance_range_km=(300.0, 500.0), max_move_km=90.0)  # room for the current
     scenario = scenario.replace(max_move_km=50.0, max_steps=120, arrival="declared", start_heading="random")
     scenario = scenario.with_tasks(scenario.random_tasks(100, seed=0))
-    auv, made = replace(CONDITIONS["underwater"], north={"constant_deg": 0.5}), {}
+    auv, made = CONDITIONS["underwater"].replace_errors(north={"constant_deg": 0.5}), {}
     for name, belief in (("dead_reckoning", "compass and log"), ("kalman", "and IGRF-13")):
         flight = Flight(scenario, errors=auv, model="IGRF-13", start_km=5.0, confidence=0.8)
         navigator = flight.navigator(name)

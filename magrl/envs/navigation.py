@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from torchrl.envs import CatTensors, Compose, RenameTransform, Transform, TransformedEnv
@@ -17,35 +18,31 @@ from magrl.envs.regions import PAPER_REGION
 from magrl.envs.scenario import Scenario
 from magrl.field import WeatherRecord
 from magrl.registry import NAMED_TASKS
-from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import STEP_PRICE, Rules
 from magrl.transforms import (
-    CONDITIONS,
     AlignmentReward,
     FieldGradient,
     GradientHeading,
     HighestSPL,
-    MagneticWeather,
     MinMaxNorm,
     ProgressReward,
     RandomStepPrice,
     ReadingObservation,
     SensorErrors,
-    Spikes,
     SPLReward,
     TrackField,
     TrueWay,
+    load_conditions,
     sensor_levels,
 )
+from magrl.transforms.errors import conditions
 from magrl.transforms.sequences import ACCURACY_KEYS
 from magrl.transforms.track import known_keys
 
 OBSERVATIONS = ("flat", "track", "readings", "dict")
 REWARDS = ("progress", "paper", "base", "spl")
-STORM_NOISE = (0.05, 0.05, 5.0)
-"""White noise of the task *Storm*, which the data sheet states: D [deg], I [deg], B_H [nT]."""
-STORMS = 256
-"""Storms of the trainings of *Storm*."""
+STORM = Path(conditions.__file__).with_name("storm.toml")
+"""File of the errors of the task *Storm*."""
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
 
@@ -194,7 +191,7 @@ def readings_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """Return the environment *Readings* with errors that no data sheet states, in an aircraft (:func:`storm_errors`).
 
-    With a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`, an episode has one of :data:`STORMS` storms with the
+    With a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`, an episode has one of 256 storms with the
     spectrum of the record and random phases; with the seeds from there on, it is in the record.
 
     Args:
@@ -208,10 +205,10 @@ def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     return readings_env(num_envs, **{"transforms": storm_errors()} | options)
 
 
-def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = False) -> list[Transform]:
+def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = False) -> Sequence[Transform]:
     """Return the errors of *Storm*: magnetic weather of the auroral zone, a drift, and spikes in 5 % of the readings.
 
-    The sizes are chosen.
+    The file ``magrl/transforms/errors/storm.toml`` states their sizes, which are chosen.
 
     Args:
         record: another record of the weather.
@@ -221,13 +218,12 @@ def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = Fals
         >>> [type(error).__name__ for error in storm_errors()]
         ['MagneticWeather', 'SensorErrors', 'Spikes']
     """
-    speed_km_h, drift = CONDITIONS["aircraft"].speed_km_h, (0.1, 0.05, 20.0)
-    none, noise = (None, None) if stated else (PERFECT, SensorStd(STORM_NOISE))
-    return [
-        MagneticWeather(record, speed_km_h=speed_km_h, surrogates=STORMS, stated=none),
-        SensorErrors(STORM_NOISE, drift=drift, stated=noise),
-        Spikes((2.0, 1.0, 200.0), rate=0.05),
-    ]
+    storm = load_conditions(STORM)
+    errors = {error: dict(options) for error, options in storm.errors.items()}
+    errors["weather"]["record"] = record
+    for options in errors.values() if stated else ():
+        options.pop("stated", None)
+    return storm.replace_errors(**errors).transforms()
 
 
 def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,7 +19,7 @@ from magrl.navigators import Navigator, policy_env
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import EarthModel, Rules, earth_model
 from magrl.transforms import Conditions, KnownPlace, TrackField, conditions_named, with_conditions
-from magrl.transforms.errors.conditions import MAGNETIC
+from magrl.transforms.errors.north import MAGNETIC
 from magrl.transforms.track import known_keys
 
 Errors: TypeAlias = Conditions | Sequence[float] | str | Path
@@ -92,12 +91,12 @@ class Flight:
         check_choice(NORTHS, north=north)
         if not isinstance(errors, Conditions):
             noise = SensorStd.of(errors).noise
-            errors = Conditions("noise", sensors={"noise": noise} if any(noise) else {})
+            errors = Conditions("noise", errors={"sensors": {"noise": noise}} if any(noise) else {})
         if north == MAGNETIC:
-            errors = replace(errors, north=MAGNETIC)
-        if errors.weather is not None:
+            errors = errors.replace_errors(north=MAGNETIC)
+        if "weather" in errors.errors:
             way_km = max(500.0, scenario.distance_range_km[1])
-            errors = replace(errors, weather={"way_km": way_km, **errors.weather})
+            errors = errors.replace_errors(weather={"way_km": way_km, **errors.errors["weather"]})
         drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
         self.base = GeomagneticNavEnv(scenario, **drift | options)
         self.env = with_conditions(self.base, errors, seed)

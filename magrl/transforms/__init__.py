@@ -11,6 +11,7 @@ from magrl.transforms.alignment import GradientHeading as GradientHeading
 from magrl.transforms.areas import NoGoAreas as NoGoAreas
 from magrl.transforms.errors.base import true_keys as true_keys
 from magrl.transforms.errors.conditions import CONDITIONS as CONDITIONS
+from magrl.transforms.errors.conditions import ERRORS as ERRORS
 from magrl.transforms.errors.conditions import Conditions as Conditions
 from magrl.transforms.errors.conditions import conditions_named as conditions_named
 from magrl.transforms.errors.conditions import load_conditions as load_conditions

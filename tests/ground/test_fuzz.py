@@ -139,7 +139,7 @@ def test_conditions_of_a_file_have_no_keys(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     for key in ("in_keys", "out_keys", "seed"):
         path.write_text(f'sensors.{key} = ["field"]', encoding="utf-8")
-        with pytest.raises(ValueError, match=f"^{path}: unknown key '{key}'"):
+        with pytest.raises(ValueError, match=f"^{path}: SensorErrors has no option '{key}'"):
             load_conditions(path)
 
 

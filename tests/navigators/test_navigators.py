@@ -49,7 +49,7 @@ def test_kalman_arrives_without_a_map() -> None:
 
 def test_a_navigator_that_is_told_of_its_arrival_searches() -> None:
     """Under constant errors the destination is not where the readings fit."""
-    biased, rates = Conditions("biased", sensors={"bias": (0.15, 0.05, 20.0)}), []
+    biased, rates = Conditions("biased", errors={"sensors": {"bias": (0.15, 0.05, 20.0)}}), []
     for search in (False, True):
         base = GeomagneticNavEnv(num_envs=30, seed=0, max_steps=30)
         navigator = make_navigator("secant", base, sensor_std=biased.std)
@@ -256,7 +256,7 @@ def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
     """A navigator that is told nothing flies by what comes with the readings."""
     bias = (0.5, 0.1, 20.0)
     env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random", max_steps=6)
-    own = Conditions("own", sensors={"noise": (0.02, 0.02, 2.0), "bias": bias})
+    own = Conditions("own", errors={"sensors": {"noise": (0.02, 0.02, 2.0), "bias": bias}})
     told, full = (
         evaluation_rollout(with_conditions(env, own), Secant(sensor_std=std))["next", "position"]
         for std in (own.std.noise, own.std)

@@ -12,7 +12,7 @@ from torchrl.envs.utils import step_mdp
 
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.field import FieldModel
-from magrl.transforms import MagneticWeather, MotionError, NorthReferenceError, SensorErrors, Spikes, VectorErrors
+from magrl.transforms import ERRORS, Conditions, MotionError, SensorErrors
 
 STD = (0.05, 0.05, 5.0)
 
@@ -30,27 +30,37 @@ def under(*errors: Transform, num_envs: int = 2) -> TransformedEnv:
     return TransformedEnv(nav(num_envs), Compose(*errors))
 
 
+SENSORS = {
+    "noise": STD,
+    "bias": (0.1, 0.1, 20.0),
+    "scale": (0.0, 0.0, 1e-3),
+    "drift": (0.05, 0.05, 10.0),
+    "resolution": (0.01, 0.01, 1.0),
+    "outage_rate": 0.2,
+    "vector": {"hard_iron_nt": (50.0,) * 3, "soft_iron": ((1e-3,) * 3,) * 3, "attitude_deg": (0.1, 0.1)},
+}
+MOTION = {"log_scale": 0.02, "log_noise": 0.01, "compass_deg": 3.0, "current_km_h": 2.0, "eddies_km_h": 0.5}
+SIZES = {
+    "motion": MOTION,
+    "weather": {"span_h": 100.0},
+    "sensors": SENSORS,
+    "spikes": {"sizes": (1.0, 1.0, 100.0), "rate": 0.1},
+    "north": "marine",
+}
+
+
 def sensor_errors(**options: object) -> SensorErrors:
-    sizes = {"bias": (0.1, 0.1, 20.0), "scale": (0.0, 0.0, 1e-3), "drift": (0.05, 0.05, 10.0), "drift_length": 200.0}
-    vector = VectorErrors((50.0,) * 3, ((1e-3,) * 3,) * 3, (0.1, 0.1))
-    rest = {"resolution": (0.01, 0.01, 1.0), "outage_rate": 0.2, "vector": vector}
-    return SensorErrors(STD, **(sizes | rest | options))
-
-
-def north_error(**options: object) -> NorthReferenceError:
-    keys = ("heading", "field", "move", "position")
-    return NorthReferenceError(0.5, 0.3, 0.2, drift_length_km=100.0, in_keys=keys, **options)
+    return SensorErrors(**SENSORS | options)
 
 
 def motion_error(**options: object) -> MotionError:
-    errors = {"log_scale": 0.02, "log_noise": 0.01, "compass_deg": 3.0}
-    return MotionError(**errors, current_km_h=2.0, eddies_km_h=0.5, speed_km_h=30.0, **options)
+    return MotionError(**MOTION, speed_km_h=30.0, **options)
 
 
 def every_error(seed: int = 0) -> Compose:
-    weather = MagneticWeather(speed_km_h=24.0, span_h=100.0, seed=seed)
-    spikes = Spikes((1.0, 1.0, 100.0), rate=0.1, seed=seed)
-    return Compose(motion_error(seed=seed), weather, sensor_errors(seed=seed), spikes, north_error(seed=seed))
+    """All errors of the table; one that :data:`SIZES` lacks has the sizes of its defaults."""
+    errors = {name: SIZES.get(name, {}) for name in ERRORS}
+    return Compose(*Conditions("every", 30.0, errors).transforms(seed))
 
 
 def all_errors(num_envs: int = 2, seed: int = 0) -> TransformedEnv:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from inspect import Parameter, signature
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
@@ -23,6 +24,7 @@ from magrl.geodesy import wrap_longitude
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms.base import Keys, StatefulTransform
 
+T = TypeVar("T")
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which accuracy is stated where errors depend on the field.
 
@@ -39,7 +41,7 @@ DISPLACEMENT = "displacement"
 class Episode(NamedTuple):
     """State of an episode at a reading: its numbers, the stream of random numbers, and whether it begins here."""
 
-    numbers: Any  # a tensor, or a TensorDict
+    numbers: Tensor
     stream: Tensor
     first: bool
 
@@ -69,13 +71,11 @@ class EpisodeNumbers(StatefulTransform):
     channel: ClassVar[int] = 0
     """Second counter: it separates the numbers of a class from others of the same seed."""
     numbers_key: NestedKey
-    """Key of the numbers of an episode ``(..., size)``, or of a record of them."""
+    """Key of the numbers of an episode ``(..., size)``."""
     stream_key: ClassVar[str]
     """Key of the state of the random numbers ``(..., 1)``, int64. Privileged."""
     size: int
     """Numbers of an episode."""
-    entries: Mapping[str, int] | None = None
-    """Numbers of each entry of a record by its name, instead of ``size``."""
     numbers_dtype: ClassVar[torch.dtype | None] = None
     """Type of these numbers; by default the first value's."""
     draws = 0
@@ -95,18 +95,26 @@ class EpisodeNumbers(StatefulTransform):
         """Keys that a step reads from the TensorDict before it."""
         return [self.numbers_key, self.stream_key]
 
-    def _constants(self, stream: Tensor) -> Tensor | TensorDict:
-        """Return the numbers of new episodes ``(..., size)``, or a record of them."""
+    def _constants(self, stream: Tensor) -> Tensor:
+        """Return the numbers of new episodes ``(..., size)``."""
         raise NotImplementedError
 
-    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor | TensorDict:
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         """Write what the numbers change in the values at ``in_keys``; return the numbers of the next step."""
         raise NotImplementedError
 
-    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
         stream = self._episode_stream(tensordict, values[0].device)
-        numbers = self._constants(stream).to(self.numbers_dtype or values[0].dtype)
+        numbers = self._begun(stream, mask).to(self.numbers_dtype or values[0].dtype)
         self._write(tensordict, values, Episode(numbers, advanced(stream, self.draws), first=True))
+
+    def _begun(self, stream: Tensor, mask: Tensor | None) -> Tensor:
+        """Return the numbers of new episodes ``(..., size)``, and 0 in rows whose episode goes on."""
+        if mask is None or mask.device.type != "cpu":  # an accelerator would wait for the number of rows
+            return self._constants(stream)
+        begun = mask.reshape(stream.shape)
+        drawn = self._constants(stream[begun])
+        return drawn.new_zeros(*stream.shape, self.size).masked_scatter(begun.unsqueeze(-1), drawn)
 
     def _episode_stream(self, tensordict: TensorDictBase, device: torch.device) -> Tensor:
         """Return the stream of the episode in each row, ``(...)``."""
@@ -129,9 +137,7 @@ class EpisodeNumbers(StatefulTransform):
         """Check the shapes that are read, and add what is written, the numbers and the state of the random ones."""
         observation_spec = super().transform_observation_spec(observation_spec)
         leaf = self._leaf(observation_spec, self.in_keys[0])
-        entries = {(): self.size} if self.entries is None else self.entries
-        for name, size in entries.items():
-            self._add(observation_spec, leaf, unravel_key((self.numbers_key, name)), size, dtype=self.numbers_dtype)
+        self._add(observation_spec, leaf, self.numbers_key, self.size, dtype=self.numbers_dtype)
         self._add(observation_spec, leaf, self.stream_key, 1, dtype=torch.int64)
         return observation_spec
 
@@ -146,6 +152,22 @@ class EpisodeErrors(EpisodeNumbers):
 
     true_keys: ClassVar[tuple[str, ...]] = ()
     """Keys of true values."""
+
+    @classmethod
+    def from_options(cls, options: Any, speed_km_h: float, seed: int = 0) -> EpisodeErrors:
+        """Return the error of a vehicle with the options that a file states.
+
+        Args:
+            options: options of the class by name.
+            speed_km_h: speed of the vehicle [km/h], for a class that has this argument.
+            seed: seed of the errors.
+
+        Raises:
+            ValueError: for an option that the class does not have, or one out of its range.
+            TypeError: for an option that is missing, or one of another type.
+        """
+        speed = {"speed_km_h": speed_km_h} if "speed_km_h" in signature(cls).parameters else {}
+        return build(cls, options, **speed, seed=seed)
 
     def accuracy(self, field: Tensor) -> SensorStd:
         """Return the standard deviations that the errors add to a reading, each ``(..., E)``.
@@ -196,8 +218,9 @@ class ReadingErrors(EpisodeErrors):
         in_keys: of the transform.
         out_keys: of the transform.
         seed: seed of the errors.
-        stated: accuracy that the vehicle knows; by default the accuracy of the errors:
-            :data:`magrl.sensor_std.PERFECT` for errors that no data sheet states.
+        stated: accuracy that the vehicle knows, or the fields of :class:`~magrl.sensor_std.SensorStd` by name; by
+            default the accuracy of the errors. Errors that no data sheet states have
+            :data:`magrl.sensor_std.PERFECT`, or no fields.
 
     :meth:`_disturb` returns the numbers of the next step, so that a drift keeps its value. :meth:`accuracy` knows no
     time: of an error that grows, it is the mean over an episode.
@@ -231,11 +254,13 @@ class ReadingErrors(EpisodeErrors):
 
     default_out_keys: ClassVar[Keys] = ("field",)
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
+    changes_inclination: ClassVar[bool] = True
+    """Whether the error may carry I beyond the vertical."""
     _accuracy: Tensor
 
-    def __init__(self, *keys: Keys | None, stated: SensorStd | None = None, **options: Any) -> None:
+    def __init__(self, *keys: Keys | None, stated: SensorStd | Mapping[str, Any] | None = None, **options: Any) -> None:
         super().__init__(*keys, **options)
-        self.stated = stated
+        self.stated = build(SensorStd, stated) if isinstance(stated, Mapping) else stated
 
     def _set_accuracy(self) -> None:
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""
@@ -250,7 +275,8 @@ class ReadingErrors(EpisodeErrors):
         """Write a reading, its true value and its accuracy, if that is not always the same."""
         if tensordict.get(self.true_keys[0], None) is None:
             tensordict.set(self.true_keys[0], value)
-        self._write_named(tensordict, field=_folded(reading) if reading.shape[-1] == 3 else reading)
+        folds = self.changes_inclination and reading.shape[-1] == 3
+        self._write_named(tensordict, field=_folded(reading) if folds else reading)
         accuracy = SensorStd(*self._accuracy.to(reading.dtype)) if accuracy is None else accuracy
         accuracy = accuracy if self.stated is None else SensorStd(*reading.new_tensor(self.stated))
         for key, std in zip(STD_KEYS, accuracy, strict=True):
@@ -273,6 +299,31 @@ def _folded(elements: Tensor) -> Tensor:
     declination, inclination, horizontal = elements.unbind(-1)
     folded = wrap_longitude(declination + 180), torch.sign(inclination) * 180 - inclination, horizontal
     return torch.where(inclination.abs().unsqueeze(-1) > 90, torch.stack(folded, -1), elements)
+
+
+def build(kind: type[T], options: Any, **given: Any) -> T:
+    """Return an object of a class with the options that a file states, and those that a program gives.
+
+    Raises:
+        ValueError: for an option that the class does not have, with those that a file may state.
+        TypeError: for options that have no names.
+
+    Example:
+        >>> build(SensorStd, {"noice": [1.0, 1.0, 5.0]})
+        Traceback (most recent call last):
+        ValueError: SensorStd has no option 'noice': choose from noise, bias, drift, iron
+    """
+    if not isinstance(options, Mapping):
+        raise TypeError(f"{kind.__name__} needs options by name, got {options!r}")
+    kinds = [base for base in kind.__mro__ if base is kind or issubclass(base, EpisodeErrors)]
+    arguments = [argument for base in kinds for argument in signature(base).parameters.values()]
+    variadic = Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD
+    names = dict.fromkeys(one.name for one in arguments if one.kind not in variadic)
+    allowed = [name for name in names if name not in ("in_keys", "out_keys", "seed", "speed_km_h")]
+    for name in options:
+        if name not in allowed:
+            raise ValueError(f"{kind.__name__} has no option {name!r}: choose from {', '.join(allowed)}")
+    return kind(**options, **given)
 
 
 def check_sizes(count: int | None = None, *, fixed: bool = False, **sizes: Sequence[float]) -> None:

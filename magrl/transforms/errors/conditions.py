@@ -1,76 +1,71 @@
-"""Conditions that vehicles navigate in: the errors of sensors, north reference and motion, and weather, as presets."""
+"""Conditions that vehicles navigate in: the table of errors, files of them, and presets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_choice, check_number, check_type
+from magrl.checks import check_number, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
-from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
-from magrl.transforms.errors.magnetic_north import MagneticNorth
+from magrl.transforms.errors.base import DISPLACEMENT, TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.motion import MotionError
-from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference
+from magrl.transforms.errors.north import NorthReferenceError
 from magrl.transforms.errors.sensors import SensorErrors
-from magrl.transforms.errors.vector import VectorErrors
+from magrl.transforms.errors.spikes import Spikes
 from magrl.transforms.errors.weather import MagneticWeather
 
-MAGNETIC = "magnetic"
-"""North of a vehicle without a true-north reference."""
-
-
+ERRORS: dict[str, type[EpisodeErrors]] = {
+    "motion": MotionError,
+    "weather": MagneticWeather,
+    "sensors": SensorErrors,
+    "spikes": Spikes,
+    "north": NorthReferenceError,
+}
+"""Errors by their names in files, in the order of an environment. An error of one's own is a further row."""
 MOVE_KM = 50.0
 """Move that the noise of a log belongs to [km]."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Errors under which a vehicle navigates: of its sensors, its north reference and its motion, and the weather.
+    """Errors under which a vehicle navigates.
 
     Args:
         name: name for messages and tables.
         speed_km_h: speed of the vehicle [km/h], for currents, the drift of a gyrocompass and the weather.
-        sensors: options of :class:`~magrl.transforms.SensorErrors`.
-        north: unit of :data:`~magrl.transforms.NORTH_REFERENCES`, or options of
-            :class:`~magrl.transforms.NorthReferenceError`; None without an error; ``"magnetic"`` for a vehicle that has
-            no true north (:class:`~magrl.transforms.MagneticNorth`).
-        motion: options of :class:`~magrl.transforms.MotionError`; None without an error.
-        weather: options of :class:`~magrl.transforms.MagneticWeather`; None without weather.
+        errors: options of each error by its name in :data:`ERRORS`. ``"north"`` may be a unit of
+            :data:`~magrl.transforms.NORTH_REFERENCES`, or ``"magnetic"`` for a vehicle that has no true north
+            (:class:`~magrl.transforms.MagneticNorth`).
 
     Raises:
-        ValueError: for an option that is out of its range, or an unknown unit or record.
-        TypeError: for an option that the part does not have.
+        ValueError: for an unknown error, option, unit or record, or an option that is out of its range.
+        TypeError: for an option that is missing, or of another type.
 
     Example:
-        >>> ship = Conditions("ship", 24.0, sensors={"noise": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
+        >>> ship = Conditions("ship", 24.0, {"sensors": {"noise": (0.02, 0.02, 5.0)}, "north": {"constant_deg": 0.1}})
         >>> ship.std
         SensorStd(noise=(0.02, 0.02, 5.0), bias=(0.1, 0.0, 0.0), drift=(0.0, 0.0, 0.0), iron=(0.0, 0.0, 0.0))
     """
 
     name: str
     speed_km_h: float = 24.0
-    sensors: Mapping[str, Any] = field(default_factory=dict)
-    north: str | Mapping[str, Any] | None = None
-    motion: Mapping[str, Any] | None = None
-    weather: Mapping[str, Any] | None = None
+    errors: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_type(str, name=self.name)
         check_number(0, above=True, speed_km_h=self.speed_km_h)
+        for name in self.errors:
+            if name not in ERRORS:
+                raise ValueError(f"Conditions have name, speed_km_h and the errors {', '.join(ERRORS)}, got {name!r}")
         _ = self._errors  # a wrong option raises here
-
-    @property
-    def perfect(self) -> bool:
-        """Whether there is no error."""
-        return not (self.sensors or self.north or self.motion) and self.weather is None
 
     def transforms(self, seed: int = 0) -> list[EpisodeErrors]:
         """Return the errors as transforms, in the order of an environment; see :func:`with_conditions`.
@@ -82,24 +77,17 @@ class Conditions:
             >>> [type(error).__name__ for error in CONDITIONS["aircraft"].transforms()]
             ['MotionError', 'MagneticWeather', 'SensorErrors', 'NorthReferenceError']
         """
-        return [make(seed=seed) for make in self._makers]
+        chosen = [(kind, self.errors[name]) for name, kind in ERRORS.items() if name in self.errors]
+        return [kind.from_options(options, self.speed_km_h, seed) for kind, options in chosen]
 
-    @cached_property
-    def _makers(self) -> list[Callable[..., EpisodeErrors]]:
-        """Functions that make the errors with a seed."""
-        makers: list[Callable[..., EpisodeErrors]] = [partial(SensorErrors, **self.sensors)]
-        if self.weather is not None:
-            makers.insert(0, partial(MagneticWeather, **self.weather, speed_km_h=self.speed_km_h))
-        if self.motion:
-            makers.insert(0, partial(MotionError, **self.motion, speed_km_h=self.speed_km_h))
-        if self.north == MAGNETIC:
-            makers.append(_compass)
-        elif isinstance(self.north, str):
-            check_choice((MAGNETIC, *NORTH_REFERENCES), north=self.north)
-            makers.append(partial(north_reference, self.north, speed_km_h=self.speed_km_h))
-        elif self.north:
-            makers.append(partial(NorthReferenceError, **self.north))
-        return makers
+    def replace_errors(self, **errors: Any) -> Conditions:
+        """Return conditions with other errors, and the rest as here.
+
+        Example:
+            >>> len(CONDITIONS["aircraft"].replace_errors(spikes={"sizes": (1.0, 1.0, 99.0), "rate": 0.1}).errors)
+            5
+        """
+        return replace(self, errors={**self.errors, **errors})
 
     @cached_property
     def _errors(self) -> list[EpisodeErrors]:
@@ -121,15 +109,16 @@ class Conditions:
             >>> CONDITIONS["laboratory"].drift_km(50.0), CONDITIONS["ship"].drift_km(50.0)
             (0.0, 4.0)
         """
-        farthest_km = max(error.farthest_km(max_move_km) for error in self._errors)
-        return float(max(self.motion is not None, math.ceil(farthest_km - max_move_km)))
+        added = [error.farthest_km(max_move_km) - max_move_km for error in self._errors]
+        moved = any(DISPLACEMENT in error.true_keys for error in self._errors)
+        return float(max(moved, math.ceil(max(added, default=0.0))))
 
     @cached_property
     def std(self) -> SensorStd:
         """Standard deviations of the errors of the readings, as a vehicle knows them, at :data:`TYPICAL_FIELD`."""
         field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        variances = sum(torch.stack(error.accuracy(field)).square() for error in self._errors)
-        rows = torch.as_tensor(variances).sqrt().tolist()
+        variances = [torch.stack(error.accuracy(field)).square() for error in self._errors]
+        rows = sum(variances, torch.zeros(4, 3, dtype=torch.float64)).sqrt().tolist()
         return SensorStd(*(tuple(round(std, 6) for std in row) for row in rows))
 
     @cached_property
@@ -144,7 +133,7 @@ class Conditions:
             >>> [round(number, 3) for number in CONDITIONS["ship"].motion_std]
             [0.027, 0.0]
         """
-        motion = self._errors[0] if isinstance(self._errors[0], MotionError) else MotionError()
+        motion = next((error for error in self._errors if isinstance(error, MotionError)), MotionError())
         log, noise = motion.log
         north = self.std.bias[0] if math.isfinite(self.std.bias[0]) else 0.0
         shares = log, motion.current_km_h / self.speed_km_h, math.radians(north)
@@ -153,16 +142,10 @@ class Conditions:
         return math.hypot(*shares) / math.sqrt(2), math.sqrt(random)
 
 
-def _compass(seed: int) -> MagneticNorth:  # noqa: ARG001
-    """Return a compass, which draws no random numbers."""
-    return MagneticNorth()
-
-
 def load_conditions(path: Path | str) -> Conditions:
-    """Read conditions from a TOML or JSON file, whose keys are the arguments of :class:`Conditions`.
+    """Read conditions from a TOML or JSON file, whose keys are ``name``, ``speed_km_h`` and those of :data:`ERRORS`.
 
-    The name is the file's by default; the options of :class:`~magrl.transforms.VectorErrors` are in
-    ``sensors.vector``.
+    The name is the file's by default. A program gives keys and seeds, not a file.
 
     Raises:
         ValueError: for a file that cannot be read, or an option that is unknown or out of its range, with the file.
@@ -184,14 +167,8 @@ def load_conditions(path: Path | str) -> Conditions:
 
 def _conditions(name: str, content: Mapping[str, Any]) -> Conditions:
     """Return the conditions that a table of a file holds."""
-    content = {"name": name, **content}
-    for part in filter(lambda value: isinstance(value, dict), content.values()):
-        if keys := [key for key in ("in_keys", "out_keys", "seed") if key in part]:
-            raise ValueError(f"unknown key {keys[0]!r}: a program gives keys and seeds, not a file of conditions")
-    sensors = dict(content.get("sensors", {}))
-    if "vector" in sensors:
-        sensors["vector"] = VectorErrors(**sensors["vector"])
-    return Conditions(**content | {"sensors": sensors})
+    own = {key: content[key] for key in ("name", "speed_km_h") if key in content}
+    return Conditions(**{"name": name, **own}, errors={key: content[key] for key in content if key not in own})
 
 
 CONDITIONS: Mapping[str, Conditions] = {
@@ -212,9 +189,9 @@ def conditions_named(name: str) -> Conditions:
         ValueError: for an unknown name, listing those known, or a file that is wrong.
 
     Example:
-        >>> conditions_named("aircraft").north
+        >>> conditions_named("aircraft").errors["north"]
         'fiber-optic'
-        >>> conditions_named("ship, disturbed").weather
+        >>> conditions_named("ship, disturbed").errors["weather"]
         {'record': 'disturbed', 'span_h': 200.0}
     """
     if isinstance(name, str) and name.endswith((".toml", ".json")):
@@ -224,7 +201,8 @@ def conditions_named(name: str) -> Conditions:
         names = ", ".join(map(repr, CONDITIONS))
         raise ValueError(f"conditions must be one of {names}, or a file that ends in .toml or .json, got {name!r}")
     chosen = CONDITIONS[vehicle]
-    return replace(chosen, name=name, weather={**(chosen.weather or {}), "record": record}) if record else chosen
+    weather = {**chosen.errors.get("weather", {}), "record": record}
+    return replace(chosen.replace_errors(weather=weather), name=name) if record else chosen
 
 
 def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -> EnvBase:
@@ -249,7 +227,7 @@ def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -
     conditions = conditions_named(conditions) if isinstance(conditions, str) else conditions
     check_type(Conditions, conditions=conditions)
     check_type(EnvBase, env=env)
-    if conditions.perfect:
+    if not conditions.errors:
         return env
     env = TransformedEnv(env, Compose(*conditions.transforms(seed)))
     _ = env.action_spec  # an error before the first episode

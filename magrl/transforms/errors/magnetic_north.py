@@ -45,7 +45,7 @@ class MagneticNorth(ReadingErrors):
         (tensor(0.), tensor([[-9.]]), tensor(9.))
     """
 
-    channel = 6
+    channel, changes_inclination = 6, False
     true_keys = ("true_field", "true_heading", "true_target_field")
     default_in_keys = ("heading", "field", "target_field")
     default_out_keys = default_in_keys

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number
-from magrl.counters import NORMAL_LIMIT, counter_stream, normal_of, stream_normal, stream_uniform
+from magrl.counters import NORMAL_LIMIT, normal_of, stream_normal, stream_uniform
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
 from magrl.transforms.base import observed_spec
 from magrl.transforms.errors.base import DISPLACEMENT, Episode, EpisodeErrors
@@ -47,7 +47,8 @@ class MotionError(EpisodeErrors):
             ``(..., 2)`` [deg].
         out_keys: true leg ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeErrors`. The errors of the
-            episode are scale, compass [deg], direction of the current and phases of the eddies [rad].
+            episode are scale, compass [deg], direction of the current and phases of the eddies [rad], and with
+            eddies the uniform numbers of their directions (:func:`eddy_waves`).
 
     Raises:
         ValueError: for a negative size, errors of the log that could turn a leg around, a current without a speed of
@@ -69,7 +70,7 @@ class MotionError(EpisodeErrors):
     true_keys = (*default_out_keys, DISPLACEMENT)
     numbers_key, stream_key = "motion_error", "motion_stream"
     in_sizes = {"move": (2,), "heading": (1,), "position": (2,)}
-    size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2  # of a step, one is used: published numbers rest on the stride
+    step_draws = 2  # one is used: published numbers rest on the stride, and on phases that are drawn without eddies
 
     def __init__(
         self,
@@ -93,10 +94,10 @@ class MotionError(EpisodeErrors):
         self.log, self.compass_deg, self.fixed = (log_scale, log_noise), compass_deg, fixed
         self.current_km_h, self.speed_km_h = current_km_h, float(speed_km_h or 1.0)
         self.eddies_km_h, self.eddy_km = eddies_km_h, eddy_km
+        self.size = self.draws = 3 + EDDIES + 2 * EDDIES * bool(eddies_km_h)
         shortest, _ = self._stretch
         if shortest <= 0:
             raise ValueError(f"log_scale {log_scale} and log_noise {log_noise} must keep every distance above 0")
-        self.register_buffer("_waves", eddy_waves(self.seed, eddy_km), persistent=False)
 
     @property
     def _stretch(self) -> tuple[float, float]:
@@ -121,7 +122,8 @@ class MotionError(EpisodeErrors):
         uniform = stream_uniform(stream, self.draws)
         sizes = uniform.new_tensor((self.log[0], self.compass_deg))
         constants = sizes.expand_as(uniform[..., :2]) if self.fixed else sizes * normal_of(uniform[..., :2])
-        return torch.cat((constants, 2 * math.pi * uniform[..., 2:]), -1)
+        angles, directions = uniform[..., 2:].tensor_split([1 + EDDIES], -1)
+        return torch.cat((constants, 2 * math.pi * angles, directions), -1)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the errors add to the commanded leg, which the environment adds."""
@@ -145,7 +147,8 @@ class MotionError(EpisodeErrors):
         hours = (distance / self.speed_km_h).unsqueeze(-1)
         displacement = displacement + hours * self.current_km_h * _unit(direction)
         if self.eddies_km_h:
-            velocity = eddy_velocity(position, self._waves, errors[..., 3:])
+            phases, directions = errors[..., 3:].tensor_split([EDDIES], -1)
+            velocity = eddy_velocity(position, eddy_waves(directions, self.eddy_km), phases)
             displacement = displacement + hours * self.eddies_km_h * velocity
         return displacement
 
@@ -191,16 +194,21 @@ class MotionError(EpisodeErrors):
         return input_spec
 
 
-def eddy_waves(seed: int, wavelength_km: float) -> Tensor:
-    """Return wave vectors of random directions in space, ``(EDDIES, 3)`` [rad on the unit sphere].
+def eddy_waves(uniform: Tensor, wavelength_km: float) -> Tensor:
+    """Return M wave vectors of random directions in space, ``(..., M, 3)`` [rad on the unit sphere].
+
+    Args:
+        uniform: ``(..., 2 M)`` uniform numbers in [0, 1): of the heights of the directions, then of their longitudes.
+        wavelength_km: wavelength [km].
 
     Example:
-        >>> eddy_waves(0, 200.0).norm(dim=-1).mul(200 / (2 * math.pi)).round()[0]  # the Earth's radius
-        tensor(6371., dtype=torch.float64)
+        >>> eddy_waves(torch.rand(16), 200.0).norm(dim=-1).mul(200 / (2 * math.pi)).round()[0]  # the Earth's radius
+        tensor(6371.)
     """
-    rows = torch.arange(EDDIES).unsqueeze(-1)
-    direction = stream_normal(counter_stream(seed, torch.nn.functional.pad(rows, (1, 0), value=-1)), 3)
-    return direction / direction.norm(dim=-1, keepdim=True) * (2 * math.pi * MEAN_RADIUS_KM / wavelength_km)
+    height, longitude = uniform.unflatten(-1, (2, -1)).unbind(-2)
+    up = 2 * height - 1
+    level = torch.sqrt(1 - up.square()).unsqueeze(-1) * _unit(2 * math.pi * longitude)
+    return torch.cat((level, up.unsqueeze(-1)), -1) * (2 * math.pi * MEAN_RADIUS_KM / wavelength_km)
 
 
 def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
@@ -212,7 +220,7 @@ def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
 
     Args:
         position: ``(..., 2)`` latitude, longitude [deg].
-        waves: ``(M, 3)`` wave vectors k, from :func:`eddy_waves`.
+        waves: ``(..., M, 3)`` wave vectors k, from :func:`eddy_waves`.
         phases: ``(..., M)`` [rad].
 
     Returns:
@@ -225,8 +233,8 @@ def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
     """
     north, east, down = local_frame(*position.unbind(-1)).unbind(-2)
     unit = waves / waves.norm(dim=-1, keepdim=True)
-    swing = torch.cos(-down @ waves.mT + phases) * math.sqrt(3 / len(waves))
-    gradient = swing @ unit
+    swing = torch.cos(phases - (waves * down.unsqueeze(-2)).sum(-1)) * math.sqrt(3 / waves.shape[-2])
+    gradient = (swing.unsqueeze(-1) * unit).sum(-2)
     # gradient x up: northward is -(gradient·east), eastward is gradient·north
     return torch.stack((-(gradient * east).sum(-1), (gradient * north).sum(-1)), -1)
 

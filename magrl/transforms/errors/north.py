@@ -18,7 +18,11 @@ from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
 from magrl.sensor_std import SensorStd
 from magrl.transforms.base import Keys
-from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
+from magrl.transforms.errors.base import Episode, EpisodeErrors, ReadingErrors, gauss_markov
+from magrl.transforms.errors.magnetic_north import MagneticNorth
+
+MAGNETIC = "magnetic"
+"""North of a vehicle without a true-north reference."""
 
 SCHULER_HOURS = 1.407
 """Period of a gyrocompass's slow oscillation, 84.4 minutes (M. Schuler, Physikalische Zeitschrift 24, 1923)."""
@@ -84,7 +88,7 @@ class NorthReferenceError(ReadingErrors):
         (tensor([[-2.]]), tensor(-2.))
     """
 
-    channel = 3
+    channel, changes_inclination = 3, False
     true_keys = ("true_field", "true_heading")
     default_in_keys = ("heading", "field", "move")
     default_out_keys = ("heading", "field")
@@ -114,6 +118,27 @@ class NorthReferenceError(ReadingErrors):
         self.sizes, self.drift_length_km = (constant_deg, drift_deg, random_deg), float(drift_length_km or 1)
         self.fixed = fixed
         self._set_accuracy()
+
+    @classmethod
+    def from_options(cls, options: Any, speed_km_h: float, seed: int = 0) -> EpisodeErrors:
+        """Return the error with options by name, of a unit of :data:`NORTH_REFERENCES`, or of a compass alone.
+
+        Args:
+            options: options; name of a unit; or :data:`MAGNETIC` for a :class:`~magrl.transforms.MagneticNorth`.
+            speed_km_h: speed of the vehicle [km/h].
+            seed: seed of the errors.
+
+        Raises:
+            ValueError: for an unknown unit, or as for other errors.
+
+        Example:
+            >>> NorthReferenceError.from_options("marine", 24.0).sizes
+            (0.375, 0.125, 0.25)
+        """
+        if not isinstance(options, str):
+            return super().from_options(options, speed_km_h, seed)
+        check_choice((MAGNETIC, *NORTH_REFERENCES), north=options)
+        return MagneticNorth() if options == MAGNETIC else north_reference(options, speed_km_h=speed_km_h, seed=seed)
 
     # Data
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.counters import normal_of, stream_uniform
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
+from magrl.transforms.errors.base import Episode, ReadingErrors, build, check_sizes, gauss_markov
 from magrl.transforms.errors.vector import VectorErrors
 
 LEVEL_DRAWS = 12
@@ -44,7 +45,8 @@ class SensorErrors(ReadingErrors):
         drift_length: its correlation length [unit of the distance of a leg, or steps].
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
         outage_rate: probability that a reading is missing; never the first of an episode.
-        vector: errors of a vector magnetometer, where the elements are D, I, B_H.
+        vector: errors of a vector magnetometer, where the elements are D, I, B_H; or the options of
+            :class:`~magrl.transforms.VectorErrors` by name.
         fixed: whether bias and scale are the errors themselves, in every episode.
         levels: function of uniform numbers ``(..., 12)`` in [0, 1), which returns further standard deviations
             ``(..., 2 E)`` for each vehicle and episode, such as :func:`~magrl.transforms.sensor_levels`: of white
@@ -53,9 +55,10 @@ class SensorErrors(ReadingErrors):
             without which the drift is by steps; and optionally the heading ``(..., 1)`` [rad], in whose axes ``vector``
             acts.
         out_keys: the reading ``(..., E)``, in place by default.
-        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
-            episode are the nested keys ``bias``, ``scale``, ``drift``, ``reading`` (the last one), with ``levels`` the
-            drawn standard deviations ``noise_std``, ``bias_std`` and ``drift_std``, and ``vector`` of that.
+        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the episode are
+            one tensor at ``sensor_error``, which :meth:`named` splits: ``drift``, ``reading`` (the last one), ``bias``
+            and ``scale``, E numbers each, ``vector`` (12) if there is one, and with ``levels`` the drawn standard
+            deviations ``noise_std``, ``bias_std`` and ``drift_std``.
 
     Raises:
         ValueError: for sizes that are negative or of another number than ``noise``, a rate outside [0, 1), a length
@@ -87,7 +90,7 @@ class SensorErrors(ReadingErrors):
         drift_length: float = DRIFT_KM,
         resolution: Sequence[float] | None = None,
         outage_rate: float = 0.0,
-        vector: VectorErrors | None = None,
+        vector: VectorErrors | Mapping[str, Any] | None = None,
         fixed: bool = False,
         levels: Callable[[Tensor], Tensor] | None = None,
         **options: Any,
@@ -107,6 +110,7 @@ class SensorErrors(ReadingErrors):
         check_number(0, above=True, drift_length=drift_length)
         if levels is not None and not callable(levels):
             raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
+        vector = build(VectorErrors, vector) if isinstance(vector, Mapping) else vector
         if vector is not None:
             check_type(VectorErrors, vector=vector)
             if "heading" not in self.in_names:
@@ -116,31 +120,48 @@ class SensorErrors(ReadingErrors):
         self.drift_length, self.outage_rate, self.vector = float(drift_length), float(outage_rate), vector
         self.fixed, self.levels, self.in_sizes = fixed, levels, {"field": (self.count,), "heading": (1,)}
         self.level_draws = LEVEL_DRAWS + 1 + self.count if levels else 0
-        names = ("bias", "scale", "drift", "reading", *(LEVELS if levels else ()))
-        self.entries = dict.fromkeys(names, self.count) | ({"vector": vector.size} if vector else {})
+        self.layout = self._layout()
+        self.size = sum(self.layout.values())
         self.draws = self.level_draws + 2 * self.count + (vector.draws if vector else 0)
         self.step_draws = 2 * self.count + 1
         self._set_accuracy()
 
-    def _constants(self, stream: Tensor) -> TensorDict:
-        """Return the errors of an episode by name, with a drift and a last reading of 0."""
+    def _layout(self) -> dict[str, int]:
+        """Return how many numbers of an episode each part has, in their order."""
+        parts = dict.fromkeys(("drift", "reading", "bias", "scale"), self.count)
+        parts |= {"vector": self.vector.size} if self.vector else {}
+        return parts | (dict.fromkeys(LEVELS, self.count) if self.levels else {})
+
+    def named(self, numbers: Tensor) -> dict[str, Tensor]:
+        """Return the errors of an episode by name, from the value ``(..., size)`` at ``sensor_error``.
+
+        Example:
+            >>> from tensordict import TensorDict
+            >>> errors = SensorErrors(bias=(0.1, 0.0, 5.0), in_keys=["field"], fixed=True)
+            >>> errors.named(errors(TensorDict(field=torch.zeros(3)))["sensor_error"])["bias"]
+            tensor([0.1000, 0.0000, 5.0000])
+        """
+        return dict(zip(self.layout, numbers.split(list(self.layout.values()), -1), strict=True))
+
+    def _constants(self, stream: Tensor) -> Tensor:
+        """Return the errors of an episode, with a drift and a last reading of 0."""
         ends = [self.level_draws, self.level_draws + 2 * self.count]
         level, constant, vector = stream_uniform(stream, self.draws).tensor_split(ends, -1)
         drawn = torch.ones_like(constant) if self.fixed else normal_of(constant)
-        bias, scale = (drawn * self._sizes[1:3].flatten()).split(self.count, -1)
-        numbers = {"bias": bias, "scale": scale, "drift": torch.zeros_like(bias), "reading": torch.zeros_like(bias)}
+        numbers = [torch.zeros_like(drawn), drawn * self._sizes[1:3].flatten()]
+        if self.vector is not None:
+            numbers.append(self.vector.constants(normal_of(vector)))
         if self.levels is not None:
             level, share, normal = level.split((LEVEL_DRAWS, 1, self.count), -1)
             noise_std, bias_std = self.levels(level).split(self.count, -1)
-            numbers["bias"] = bias + bias_std * share.sqrt() * normal_of(normal)
-            numbers |= dict(zip(LEVELS, (noise_std, bias_std, bias_std * (1 - share).sqrt()), strict=True))
-        if self.vector is not None:
-            numbers["vector"] = self.vector.constants(normal_of(vector))
-        return TensorDict(numbers, batch_size=stream.shape)
+            numbers[1] = numbers[1] + pad(bias_std * share.sqrt() * normal_of(normal), (0, self.count))
+            numbers += [noise_std, bias_std, bias_std * (1 - share).sqrt()]
+        return torch.cat(numbers, -1)
 
-    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> TensorDict:
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (value, *others), dtype = values, values[0].dtype
-        errors, stream, first = episode
+        numbers, stream, first = episode
+        errors = self.named(numbers)
         noise_std, _, _, drift_std, resolution = self._sizes.to(dtype)
         *stated, iron = self._accuracy.to(dtype)
         if self.levels is not None:
@@ -158,7 +179,7 @@ class SensorErrors(ReadingErrors):
         reading = torch.where(missing, errors["reading"], reading)
         std = SensorStd(torch.where(missing, OUTAGE_STD, stated[0]), stated[1], stated[2], iron)
         self._measure(tensordict, value, reading, std)
-        return errors.clone(recurse=False).update({"drift": drift, "reading": reading})
+        return torch.cat((drift, reading, numbers[..., 2 * self.count :]), -1)
 
     def accuracy(self, field: Tensor) -> SensorStd:
         """Return the standard deviations that the errors add to a reading, without ``levels``, each ``(..., E)``.

@@ -8,11 +8,14 @@ import fly
 import pytest
 import torch
 import tyro
+from support.errors import every_error
 from tensordict import TensorDict
 from torch import nn
+from torch.nn.functional import pad
 from torchrl.envs.utils import step_mdp
 
 from magrl import Anywhere, Kalman
+from magrl.counters import stream_normal
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
@@ -22,20 +25,22 @@ from magrl.navigators import Secant, policy_env
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
 from magrl.transforms import (
     CONDITIONS,
+    ERRORS,
     Conditions,
     MagneticWeather,
     MotionError,
     NorthReferenceError,
     SensorErrors,
+    Spikes,
     TrackField,
     VectorErrors,
     conditions_named,
     load_conditions,
     with_conditions,
 )
-from magrl.transforms.errors.base import TYPICAL_FIELD
+from magrl.transforms.errors.base import TYPICAL_FIELD, Episode, ReadingErrors, true_keys
 
-ERRORS = [name for name in CONDITIONS if name != "laboratory"]
+NAMES = [name for name in CONDITIONS if name != "laboratory"]
 
 
 def nav(num_envs: int, drift_km: float = 0.0, **options: object) -> GeomagneticNavEnv:
@@ -59,7 +64,7 @@ class TypicalField(nn.Module):
         return field_vector(torch.tensor(TYPICAL_FIELD, dtype=torch.float64)).expand(*latitude.shape, 3)
 
 
-@pytest.mark.parametrize("name", ERRORS)
+@pytest.mark.parametrize("name", NAMES)
 def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
     """At the latitude at which a dipole has the typical inclination; the weather of a ship over its way of 500 km."""
     region = Scenario(region=Region((39, 43), (160, 170)))
@@ -76,11 +81,14 @@ def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
     torch.testing.assert_close(size, measured.float(), rtol=0.12, atol=0)
 
 
+VECTOR = VectorErrors((10.0,) * 3, attitude_deg=(0.1, 0.1))
 EVERY_ERROR = Conditions(
     "own",
-    sensors={"scale": (0.01,) * 3, "outage_rate": 0.3, "vector": VectorErrors((10.0,) * 3, attitude_deg=(0.1, 0.1))},
-    north="marine",
-    weather={"record": "disturbed"},
+    errors={
+        "sensors": {"scale": (0.01,) * 3, "outage_rate": 0.3, "vector": VECTOR},
+        "north": "marine",
+        "weather": {"record": "disturbed"},
+    },
 )
 
 
@@ -97,7 +105,7 @@ def test_what_is_told_follows_from_the_reading(conditions: Conditions) -> None:
     read = rows["sensor_std"][:, 1] < OUTAGE_STD
     assert 20 <= read.sum() < (55 if conditions is EVERY_ERROR else 61)
     tangent = torch.tan(torch.deg2rad(rows["field"][read, 1])) / 2
-    grows = conditions.north != "low-cost"
+    grows = conditions.errors["north"] != "low-cost"
     north = conditions.transforms()[-1].accuracy(torch.zeros(3))
     for key, std, own in zip(STD_KEYS, conditions.std, north, strict=True):
         expected = torch.tensor(std).repeat(len(tangent), 1)
@@ -109,7 +117,8 @@ def test_the_variances_of_all_errors_add_up() -> None:
     """By hand at I = 45 deg, B_H = 20000 nT, D = 0: weather, hard iron, bias, noise and north."""
     weather = {"record": "disturbed"}
     sensors = {"noise": (0.3, 0.0, 4.0), "bias": (0.0, 0.0, 5.0), "vector": VectorErrors((10.0,) * 3)}
-    conditions = Conditions("own", sensors=sensors, north={"constant_deg": 0.4, "random_deg": 0.4}, weather=weather)
+    north = {"constant_deg": 0.4, "random_deg": 0.4}
+    conditions = Conditions("own", errors={"sensors": sensors, "north": north, "weather": weather})
     reading = torch.tensor([0.0, 45.0, 20000.0], dtype=torch.float64)
     parts = torch.stack([torch.stack(part.accuracy(reading)) for part in conditions.transforms()])
     std = SensorStd(*parts.square().sum(0).sqrt())
@@ -188,7 +197,7 @@ def test_own_errors_in_a_file() -> None:
         "motion": {"log_scale": 0.02, "current_km_h": 1.0},
         "weather": {"record": "disturbed"},
     }
-    boat = Conditions("survey boat", 15.0, **options)
+    boat = Conditions("survey boat", 15.0, options)
     assert (load_conditions(BOAT).name, load_conditions(BOAT).std) == (boat.name, boat.std)
     envs = [with_conditions(nav(2, 8.0, max_steps=2), each, 3) for each in (str(BOAT), boat)]
     flown = [evaluation_rollout(env, Secant()) for env in envs]
@@ -202,7 +211,21 @@ def test_own_errors_in_a_file() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("speed = 3", r"mine\.toml: .*unexpected keyword argument 'speed'"),
+        (
+            "speed = 3",
+            r"mine\.toml: Conditions have name, .*errors motion, weather, sensors, spikes, north, got 'speed'",
+        ),
+        ("sensors.bais = [1, 1, 1]", r"SensorErrors has no option 'bais': choose from noise, bias, .*levels, stated$"),
+        ("sensors.seed = 3", r"SensorErrors has no option 'seed'"),
+        ("spikes.rates = 0.1", r"Spikes has no option 'rates': choose from sizes, rate, stated$"),
+        ("spikes.rate = 0.1", r"mine\.toml: Spikes.*missing.*'sizes'"),
+        ("motion.speed_km_h = 3", r"MotionError has no option 'speed_km_h'"),
+        ("motion = 3", r"mine\.toml: MotionError needs options by name, got 3"),
+        (
+            "sensors.vector.hard_iron = [1, 1, 1]",
+            r"VectorErrors has no option 'hard_iron': .*soft_iron, attitude_deg, fixed",
+        ),
+        ("weather.stated.nois = [1, 1, 1]", r"SensorStd has no option 'nois': choose from noise, bias, drift, iron"),
         ("[sensors.vector]\nhard_iron_nt = 3", r"mine\.toml: hard_iron_nt must be 3 .*got 3"),
         ("north = 'best'", r"mine\.toml: .*must be one of 'magnetic', 'fiber-optic'"),
         ("[north", r"mine\.toml: the file is not valid TOML"),
@@ -214,6 +237,47 @@ def test_files_of_errors_that_are_refused(tmp_path: Path, text: str | None, mess
         (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         conditions_named(str(tmp_path / "mine.toml"))
+
+
+class Temperature(ReadingErrors):
+    """An error of B_H, constant in an episode, as a user writes it."""
+
+    channel = 8
+    default_in_keys, in_sizes = ("field",), {"field": (3,)}
+    numbers_key, stream_key = "temperature_error", "temperature_stream"
+    size = draws = 1
+
+    def __init__(self, std_nt: float = 10.0, **options: object) -> None:
+        super().__init__(**options)
+        self.std_nt = std_nt
+        self._set_accuracy()
+
+    def _constants(self, stream: torch.Tensor) -> torch.Tensor:
+        return self.std_nt * stream_normal(stream, self.draws)
+
+    def _disturb(self, tensordict: TensorDict, values: list[torch.Tensor], episode: Episode) -> torch.Tensor:
+        self._measure(tensordict, values[0], values[0] + pad(episode.numbers, (2, 0)))
+        return episode.numbers
+
+    def accuracy(self, field: torch.Tensor) -> SensorStd:
+        none = torch.zeros_like(field)
+        return SensorStd(none, none + field.new_tensor((0.0, 0.0, self.std_nt)), none, none)
+
+
+def test_an_error_is_one_class_and_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files, conditions, environments, the accuracy that vehicles know, and the tests then have it."""
+    monkeypatch.setitem(ERRORS, "temperature", Temperature)
+    (tmp_path / "warm.toml").write_text("temperature.std_nt = 30.0\nspikes = { sizes = [1, 1, 9], rate = 0.5 }")
+    warm = load_conditions(tmp_path / "warm.toml")
+    assert [type(error) for error in warm.transforms()] == [Spikes, Temperature]
+    assert warm.std.bias == (0.0, 0.0, 30.0)
+    state = with_conditions(nav(500), warm).reset()
+    assert state["temperature_error"].std().item() == pytest.approx(30.0, rel=0.1)
+    assert (state["field"] - state["true_field"])[:, 2].std().item() == pytest.approx(30.7, rel=0.1)
+    assert {"temperature_error", "temperature_stream"} <= set(true_keys())
+    assert Temperature in map(type, every_error())
+    with pytest.raises(ValueError, match=r"Temperature has no option 'std': choose from std_nt, stated$"):
+        Conditions("own", errors={"temperature": {"std": 3.0}})
 
 
 def test_fly_under_conditions(tmp_path: Path) -> None:
@@ -231,7 +295,7 @@ def test_fly_under_conditions(tmp_path: Path) -> None:
 def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> None:
     """It goes the same way whatever the reading is, within a percent of what the reading is worth otherwise."""
     noise = (0.05, 0.05, 5.0)
-    env = with_conditions(nav(10), Conditions("noise", sensors={"noise": noise}), seed=0)
+    env = with_conditions(nav(10), Conditions("noise", errors={"sensors": {"noise": noise}}), seed=0)
     navigator = make_navigator(name, env.base_env, sensor_std=noise)
     env = policy_env(env, navigator)
     step = env.rollout(4, navigator, break_when_any_done=False)[:, -1]

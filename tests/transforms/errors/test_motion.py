@@ -61,23 +61,36 @@ def test_a_vehicle_at_rest_does_not_drift() -> None:
 
 def test_eddies_are_free_of_divergence_and_of_unit_size() -> None:
     draw = torch.Generator().manual_seed(0)
-    waves = eddy_waves(0, 200.0)
-    phases = 2 * math.pi * torch.rand(20_000, EDDIES, generator=draw, dtype=F64)
+    uniform = torch.rand(20_000, 3 * EDDIES, generator=draw, dtype=F64)
+    waves, phases = eddy_waves(uniform[:, EDDIES:], 200.0), 2 * math.pi * uniform[:, :EDDIES]
     place = torch.tensor([60.0, 20.0], dtype=F64).expand(20_000, 2)
     speed = eddy_velocity(place, waves, phases)
-    assert speed.square().sum(-1).mean().item() == pytest.approx(1, abs=0.35)  # 8 waves, not in all directions alike
-    many = torch.cat([eddy_velocity(place[:50], eddy_waves(seed, 200.0), phases[:50]) for seed in range(400)])
-    assert many.square().sum(-1).mean().item() == pytest.approx(1, abs=0.03)
+    torch.testing.assert_close(speed.square().mean(0), torch.full((2,), 0.5, dtype=F64), atol=0.01, rtol=0)
+    one = eddy_velocity(place, waves[0], phases)
+    assert one.square().sum(-1).mean().item() == pytest.approx(1, abs=0.35)  # 8 waves, not in all directions alike
     assert speed.norm(dim=-1).max() < math.sqrt(3 * EDDIES)
 
     def flux(offset: tuple[float, float], axis: int) -> Tensor:
         at = place[:100] + torch.tensor(offset, dtype=F64)
-        return eddy_velocity(at, waves, phases[:100])[:, axis] * (at[:, 0].deg2rad().cos() if axis == 0 else 1)
+        return eddy_velocity(at, waves[:100], phases[:100])[:, axis] * (at[:, 0].deg2rad().cos() if axis == 0 else 1)
 
     h = 1e-4
     divergence = (flux((h, 0), 0) - flux((-h, 0), 0)) + (flux((0, h), 1) - flux((0, -h), 1))
     slope = (flux((h, 0), 0) - flux((-h, 0), 0)).abs().mean()
     assert divergence.abs().max() < 1e-5 * slope
+
+
+def test_each_episode_has_eddies_of_its_own() -> None:
+    """In their directions, too, which an agent could learn otherwise; without eddies, none are drawn."""
+    env = TransformedEnv(nav(3), MotionError(eddies_km_h=2.0, speed_km_h=20.0, seed=1))
+    first, second = env.reset(), env.reset()
+    errors = torch.cat((first["motion_error"], second["motion_error"]))
+    waves = eddy_waves(errors[:, 3 + EDDIES :], 200.0)
+    assert len(waves.flatten(0, 1).unique(dim=0)) == 6 * EDDIES
+    after = env.step(second.clone().set("action", torch.tensor([[50.0, 0.0]]).expand(3, -1)))["next"]
+    velocity = 2.0 * eddy_velocity(second["position"], waves[3:].double(), errors[3:, 3 : 3 + EDDIES].double())
+    torch.testing.assert_close(after["displacement"], 2.5 * velocity, atol=1e-3, rtol=0)
+    assert MotionError(log_scale=0.1).size == 3 + EDDIES
 
 
 def test_the_environment_must_allow_the_farthest_move() -> None:

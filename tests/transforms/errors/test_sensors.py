@@ -36,7 +36,8 @@ def test_drift_is_stationary_and_forgets_with_the_way() -> None:
     count = 4000
     env = TransformedEnv(nav(count), SensorErrors((0.0,) * 3, drift=(0.1, 0.2, 30.0), drift_length=40.0))
     step = torch.tensor([[[20.0, 0.1]], [[0.0, 0.0]], [[20.0, 1.0]]]).expand(-1, count, -1)
-    drift = torch.stack([s["sensor_error", "drift"] / torch.tensor([0.1, 0.2, 30.0]) for s in flown(env, step)])
+    named = [env.transform.named(state["sensor_error"]) for state in flown(env, step)]
+    drift = torch.stack([errors["drift"] for errors in named]) / torch.tensor([0.1, 0.2, 30.0])
     torch.testing.assert_close(drift.std(1), torch.ones(4, 3), atol=0.05, rtol=0)
     assert torch.equal(drift[1], drift[2])  # no way, no change
     for later, correlation in ((1, math.exp(-0.5)), (3, math.exp(-1))):
@@ -61,7 +62,7 @@ def test_an_outage_repeats_the_last_reading() -> None:
 def test_drift_by_steps_without_a_move() -> None:
     errors = SensorErrors(drift=(1.0, 1.0, 1.0), drift_length=2.0, in_keys=["field"])
     before, after = flown(TransformedEnv(nav(4000), errors), torch.zeros(1, 4000, 2))
-    pair = torch.stack([state["sensor_error", "drift"][:, 0] for state in (before, after)])
+    pair = torch.stack([errors.named(state["sensor_error"])["drift"][:, 0] for state in (before, after)])
     assert torch.corrcoef(pair)[0, 1].item() == pytest.approx(math.exp(-0.5), abs=0.05)
 
 

@@ -118,7 +118,7 @@ def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
     """From the quiet day on, a storm comes after two days: 12 nT over 500 km as a ship, 32 nT over 1800 km."""
     stated = []
     for longest, own in ((300.0, {}), (500.0, {}), (1800.0, {}), (1800.0, {"way_km": 500.0})):
-        ship = Conditions("ship", SHIP, weather={"record": "quiet", "span_h": 200.0, **own})
+        ship = Conditions("ship", SHIP, {"weather": {"record": "quiet", "span_h": 200.0, **own}})
         scenario = Scenario(distance_range_km=(100.0, longest), tasks=named_tasks("figure-4-1"))
         stated.append(Flight(scenario, errors=ship).sensor_std.drift[2])
     assert stated == pytest.approx([12, 12, 32, 12], abs=0.5)
