@@ -26,7 +26,7 @@ TRACK_DIGESTS = {
     "box-v2": ("e532e868b7a49993", "e61bb9afe586f589"),
     "earth-v2": ("49f64964da2779f5", "eb6505220e03610b"),
     "alone-v2": ("9d5691e12866b3c3", "eb6505220e03610b"),
-    "vehicles-v2": ("c293a315e0fae9c6", "b820e02dace25592"),
+    "vehicles-v3": ("c293a315e0fae9c6", "f8f5f7e3e6f49ba6"),
     "north-v1": ("e35c4d00c50322a3", "bcb45c2e6536f22e"),
 }
 """Of the declaration and tasks, and of readings."""

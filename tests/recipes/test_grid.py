@@ -35,7 +35,7 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
             assert len(made.errors) == (len(made.conditions) + len(made.levels) or len(LEVELS))
     for error in grid.declared(figures.FILE)["errors"].values():
         for size in error["sizes"]:
-            assert not figures.one_error(error["lines"], size).perfect
+            assert len(figures.one_error(error["lines"], size).errors) in (1, 2)
 
 
 def test_bad_usage(tmp_path: Path, monkeypatch) -> None:
@@ -105,8 +105,8 @@ def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
 
 
 def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, monkeypatch) -> None:
-    few = replace(benchmark.TRACKS["vehicles-v2"], **NEAR, conditions=["ship"])
-    monkeypatch.setitem(benchmark.TRACKS, "vehicles-v2", few)
+    few = replace(benchmark.TRACKS["vehicles-v3"], **NEAR, conditions=["ship"])
+    monkeypatch.setitem(benchmark.TRACKS, "vehicles-v3", few)
     for confidence, ends in ((0.0, "100.0 / 0.0"), (1.0, "0.0 / 0.0")):
         grid.make(("confidence",), navigators=("geodesic",), tasks=2, confidence=confidence, out=tmp_path / "new")
         head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
