@@ -72,7 +72,7 @@ def test_the_elements_of_the_destination_count_where_they_are_given() -> None:
         vehicle = begun(target=place, start_km=5.0, model="IGRF-2020", **more)
         vehicle.step(*at(0.0), heading=60.0)
         ways.append(vehicle.step(*at(10.0, 17.3), heading=60.0, distance=20.0).confidence)
-        assert vehicle.target == pytest.approx(given, abs=1e-9) if more else vehicle.target != given
+        assert (vehicle.target == pytest.approx(given, rel=1e-6)) == bool(more)
     assert begun(target=given, start_km=5.0, target_std=(0.1, 0.1, 9.0))._rules.target_std == (0.1, 0.1, 9.0)
 
 

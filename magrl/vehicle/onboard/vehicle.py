@@ -19,13 +19,13 @@ from torch import Tensor, nn
 from magrl import tracking
 from magrl.checks import check_type
 from magrl.files import write_atomically
-from magrl.sensor_std import OUTAGE_STD, SensorStd
+from magrl.sensor_std import OUTAGE_STD
 from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
-from magrl.vehicle.onboard.known import Knowledge, check_first_reading, fixed
+from magrl.vehicle.onboard.known import check_first_reading, fixed, known_at_start
 
 USUAL: dict[str, Any] = {
     "arrival": "declared",
@@ -71,8 +71,7 @@ class Onboard:
         (0.0, None)
     """
 
-    target: Any = None
-    """Elements at the destination; None before :meth:`start`."""
+    _template: Any = None  # a Reading with what the vehicle knows at the start
 
     def __init__(self, navigator: str | nn.Module = "anywhere", **options: Any) -> None:
         check_type((str, nn.Module), navigator=navigator)
@@ -88,6 +87,11 @@ class Onboard:
         shorter = {limit: min(getattr(given, limit), value) for limit, value in most.items()}
         content = b"".join(value.cpu().numpy().tobytes() for value in module.state_dict().values())
         self.options = given.replace(**shorter, navigator=name, weights=hashlib.sha256(content).hexdigest())
+
+    @property
+    def target(self) -> Any:
+        """Elements at the destination; None before :meth:`start`."""
+        return None if self._template is None else tuple(self._template.target.tolist())
 
     def start(
         self,
@@ -136,15 +140,10 @@ class Onboard:
         given |= {"target_elements": target_elements, "target_std": target_std}
         given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
         journal = Journal(options=self.options, **given)
-        known = Knowledge.of(journal)
-        limits.check_earth_reading(*known.target, what="the target")
-        if text := limits.out_of_range(self._range, known.target):
+        rules, template = known_at_start(journal)
+        if text := limits.out_of_range(self._range, template.target.tolist()):
             raise ValueError(f"the target: {text}")
-        rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
-        self._journal, self._knowledge, self._rules = journal, known, rules
-        self.target = self._comparable(known.target)
-        self._known = known.elements and (self._comparable(known.elements), known.std)
-        self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
+        self._journal, self._rules, self._template = journal, rules, template
         self._steps: tuple[Step | Fix, ...] = ()
         self._number = 0  # of steps without fixes
         self._state: State | None = None
@@ -184,7 +183,7 @@ class Onboard:
             RuntimeError: before :meth:`start`.
             ValueError: for values that are not possible, naming the value and what would be right.
         """
-        if self.target is None:
+        if self._template is None:
             raise RuntimeError(_NOT_STARTED)
         if self.options.magnetic and declination is not None:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
@@ -208,7 +207,7 @@ class Onboard:
             ValueError: for a fix that does not fit the estimated place (p < 0.001).
         """
         fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
-        if self.target is None or self._state is None or self._rules.start_km is None:
+        if self._template is None or self._state is None or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
         self._state, self._doubt = fixed(self._state, fix), Doubt()
         self._steps += (fix,)
@@ -225,14 +224,12 @@ class Onboard:
         with torch.inference_mode():
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
-                if self._known:
-                    there, std = self._known
-                    check_first_reading(elements, there, self.options.accuracy, std, track.tail.item())
+                check_first_reading(reading, track.tail.item())
                 self._other = self._other and self._other.begun(self.options, reading)
             else:
                 track = tracking.advance(self._rules, self._state, reading)
             action, decision = self._act(track, reading)
-        if (self._known or self._state is not None) and read[1:] != (None, None):
+        if (reading.known is not None or self._state is not None) and read[1:] != (None, None):
             self._doubt = self._doubt.after(track, first=self._state is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
@@ -241,16 +238,18 @@ class Onboard:
 
     def _reading(self, step: Step, elements: limits.Triple, course: float) -> Reading:
         """Return the reading of the pilot; a missing element is the last one, with the accuracy of an outage."""
-        rows = elements, self.target, *(self._known or ())
-        field, target, *there = torch.tensor(rows, dtype=torch.float32)
         missing = torch.tensor([value is None for value in self._comparable(step.elements)])
-        std = self._std._replace(noise=self._std.noise.masked_fill(missing, OUTAGE_STD))
+        std = self._template.std
         distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
-        known, known_std = there or (None, None)
-        reading = Reading(field, target, distance, heading, std, torch.tensor(self._number), known, known_std)
         leg = step.distance_std, step.distance * math.radians(step.heading_std)
-        leg_std = torch.tensor(leg, dtype=torch.float64) if any(leg) else None
-        return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place, leg_std=leg_std)
+        return self._template._replace(
+            field=torch.tensor(elements, dtype=torch.float32),
+            distance=distance,
+            heading=heading,
+            std=std._replace(noise=std.noise.masked_fill(missing, OUTAGE_STD)),
+            step=torch.tensor(self._number),
+            leg_std=torch.tensor(leg, dtype=torch.float64) if any(leg) else None,
+        )
 
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
         """Return the action of the navigator, with its declaration, and the decision behind that."""
@@ -287,7 +286,7 @@ class Onboard:
         """Return the command: to stop, or the action of the navigator."""
         radius = track.posterior.radius(self.options.confidence).item()
         stop, reason = self._stop(track, decision, radius)
-        if not (stop or self._steps or self._known):
+        if not (stop or self._steps or self._template.known is not None):
             reason = _UNCHECKED[self.options.north]
         distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
         steer = math.degrees(course + turn) % 360.0
@@ -349,7 +348,7 @@ class Onboard:
             RuntimeError: before :meth:`start`.
             OSError: if the file cannot be written.
         """
-        if self.target is None:
+        if self._template is None:
             raise RuntimeError(_NOT_STARTED)
         write_atomically(Path(path), self._journal.replace(steps=self._steps).model_dump_json().encode())
 
