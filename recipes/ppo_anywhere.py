@@ -22,6 +22,7 @@ from magrl import Anywhere, paper
 from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
+from magrl.envs.scenario import rule_settings
 from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
@@ -59,7 +60,7 @@ TRANSITION = (
 )
 
 
-class Config(PlanetConfig):
+class Config(rule_settings("arrival", "radius_km", max_steps=120), PlanetConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["far", "fast"] = "far"
@@ -72,14 +73,9 @@ class Config(PlanetConfig):
     gamma: Discount = 0.999
     num_regions: Count = 2048
     distance_range_km: Rising = (150.0, 1800.0)
-    max_steps: Count = 120
     epochs: Count = 3
     batch_size: Count = 16_384
 
-    arrival: Literal["objective", "declared"] = "objective"
-    """Rule of arrival: by the objective, or declared by the vehicle within ``radius_km``."""
-    radius_km: Positive = 25.0
-    """Distance from the destination within which a declaration is correct [km]."""
     range_km: Positive = RANGE_KM
     """Prior standard deviation of the displacement to the destination along each axis [km]."""
     price_range: Rising = (0.1, 30.0)
@@ -147,9 +143,7 @@ def train(config: Config) -> dict[str, float]:
     torch.manual_seed(config.seed)
     with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
         # Environments
-        options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
-        options |= {"device": config.device, "arrival": config.arrival, "radius_km": config.radius_km}
-        options |= config.limits
+        options = config.rules | {"start_heading": "random", "drift_km": config.drift_km, "device": config.device}
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
         others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)

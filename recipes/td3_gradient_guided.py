@@ -19,6 +19,7 @@ from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import NO_GO_STEPS, guidance_pair
+from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
@@ -48,10 +49,10 @@ from torchrl.modules import AdditiveGaussianModule
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_noise")
-ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
+ENV_OPTIONS = {"objective_limit", "device"}
 
 
-class Config(RunConfig):
+class Config(rule_settings("start_heading"), RunConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
@@ -62,8 +63,6 @@ class Config(RunConfig):
     """Gradient guidance: the theoretical heading and its alignment reward."""
 
     # Environment
-    start_heading: Literal["north", "random"] = "north"
-    """Heading at the start of an episode."""
     distance_cost: NonNegative = 0.0
     """Cost of a leg [1/km]; 0.1 in presets fast and nogo, none in the paper."""
     objective_limit: Positive | None = None
@@ -207,7 +206,8 @@ def train(config: Config) -> dict[str, float]:
     name += "-nogo" if config.task == "nogo" != config.preset else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        options = config.model_dump(include=ENV_OPTIONS) | ({"max_steps": NO_GO_STEPS} if config.task == "nogo" else {})
+        options = config.rules | config.model_dump(include=ENV_OPTIONS)
+        options |= {"max_steps": NO_GO_STEPS} if config.task == "nogo" else {}
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
         validation, test = run.evaluation_envs(*areas(config), **options)
         observed = config.model_dump(include={"observe_heading", "observe_difference"})

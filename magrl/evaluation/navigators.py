@@ -231,7 +231,7 @@ def fitted(policy: TensorDictModuleBase, env: GeomagneticNavEnv, **rules: Any) -
     if not isinstance(policy, Navigator):
         return policy
     policy = policy.fitted(env, rules)
-    return Declaring(policy, **env.limits | rules) if env.arrival.declared and not policy.declares else policy
+    return Declaring(policy, **env.limits | rules) if env.scenario.declared and not policy.declares else policy
 
 
 def _kind(name: str) -> TrainedAgent | type[Navigator]:

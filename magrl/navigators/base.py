@@ -141,8 +141,12 @@ class Navigator(TensorDictModuleBase):
         Raises:
             ValueError: for an option out of its range, or an environment that the navigator cannot navigate in.
         """
-        bounds = {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
-        return cls(**bounds | cls.env_options(env, SensorStd.of(sensor_std)) | options)
+        return cls(**cls.bounds(env) | cls.env_options(env, SensorStd.of(sensor_std)) | options)
+
+    @staticmethod
+    def bounds(env: GeomagneticNavEnv) -> dict[str, Any]:
+        """Return the limits of an environment as the constructor names them."""
+        return {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import Navigator
-from magrl.sensor_std import STD_KEYS, SensorStd
+from magrl.sensor_std import STD_KEYS
 from magrl.tracking.network import load_pilot, pretrained
 from magrl.tracking.pilot import Reading, Rules, State, Track, act, advance, begin, blank, declaring, step
 from magrl.transforms.errors.known import PLACE_KEYS
@@ -75,8 +75,8 @@ class Kalman(Navigator):
         return self.adapted(**env.limits | dict(rules) | shorter)
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
-        """Return the limits of the environment."""
+    def bounds(env: GeomagneticNavEnv) -> dict[str, Any]:
+        """Return the rules that a vehicle knows."""
         return env.limits
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
@@ -138,7 +138,7 @@ class Anywhere(Kalman):
         self.network = network
 
 
-LIMITS = ("max_move_km", "max_turn_rad")
+LIMITS = ("max_move_km", "max_turn_deg")
 
 
 class Declaring(Kalman):

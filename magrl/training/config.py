@@ -15,7 +15,7 @@ from torchrl.envs import Transform
 from magrl import paper
 from magrl.checks import CheckedModel, UsageError, check_device, printable, short
 from magrl.envs import Scenario, load_scenario
-from magrl.envs.scenario import check_zeta
+from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document
 from magrl.training.loggers import Logger, WandbMode, check_logger
 from magrl.transforms import MotionError
@@ -28,7 +28,6 @@ PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Discount = Annotated[float, Field(ge=0, lt=1)]
 Widths = Annotated[tuple[Count, ...], Field(min_length=1)]
 Seed = Annotated[int, Field(ge=0, lt=paper.FIRST_RESERVED_SEED)]
-Threshold = Annotated[float, AfterValidator(check_zeta)]
 Noise = tuple[NonNegative, NonNegative, NonNegative]
 
 
@@ -48,7 +47,7 @@ CHANGEABLE = ("device", "logger", "wandb_mode", *WANDB_OPTIONS, "log_every", "ch
 """Settings that may be edited in ``config.json`` before a run is resumed: they are not part of the training."""
 
 
-class RunConfig(CheckedModel):
+class RunConfig(rule_settings("zeta"), CheckedModel):  # type: ignore[misc]
     """Settings that all recipes share.
 
     Raises:
@@ -86,8 +85,6 @@ class RunConfig(CheckedModel):
     """Scenario file (.toml or .json) of region, date and altitude (docs/data.md); the paper's by default."""
     num_envs: Count = 512
     """Number of vehicles."""
-    zeta: Threshold = 0.01
-    """Arrival threshold on the objective (Eq. 2-7), below 3."""
     noise: Noise = (0.0, 0.0, 0.0)
     """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT], in training and evaluations."""
     total_frames: Count = 204_800
@@ -119,9 +116,8 @@ class RunConfig(CheckedModel):
             scenario = self.load_scenario()
         except OSError as error:
             raise ValueError(str(error)) from None
-        for name in ("zeta", "start_heading", "max_steps"):
-            given, value = scenario.given(name), getattr(self, name, None)
-            if None not in (given, value) and given != value:
+        for name, value in self.rules.items():
+            if (given := scenario.given(name)) not in (None, value):
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"the scenario sets {name} = {given!r}, the training {value!r}: add {option} {given}")
         if scenario.arrival == "declared":
@@ -133,36 +129,35 @@ class RunConfig(CheckedModel):
         """Return the scenario of the file, or the paper's."""
         return Scenario() if self.scenario is None else load_scenario(self.scenario)
 
+    @property
+    def rules(self) -> dict[str, Any]:
+        """Rules of an episode among the settings, which replace the scenario's."""
+        return self.model_dump(include=set(RULES))
+
     def linear(self, name: str, remaining: float) -> float:
         """Interpolate a setting linearly from ``name`` to ``final_name``, by the remaining share of the training."""
         start, end = getattr(self, name), getattr(self, f"final_{name}")
         return end + remaining * (start - end)
 
 
-class PlanetConfig(RunConfig):
+class PlanetConfig(rule_settings("max_move_km", "max_turn_deg", "max_steps"), RunConfig):  # type: ignore[misc]
     """Settings of PPO recipes that train on random planets and learn corrections of legs.
 
     Example:
-        >>> PlanetConfig(max_move_km=10.0, drift=0.1).limits
-        {'max_move_km': 10.0, 'max_turn_deg': 90.0, 'drift_km': 1.0}
+        >>> PlanetConfig(max_move_km=10.0, drift=0.1).drift_km
+        1.0
     """
 
     eval_every: Count = 10
     learning_rate: Positive = 3e-4
     final_learning_rate: Positive = 1e-5
 
-    max_move_km: Positive = 50.0
-    """Longest leg [km]."""
-    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """Largest turn to either side before a leg [deg]."""
     drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
     num_regions: Count = 1024
     """Number of training regions, two on each random planet."""
     distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a task [km]."""
-    max_steps: Count = 50
-    """Legs after which an episode is truncated."""
     noise_exponent: Positive = 1.0
     """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
     steps_per_batch: Count = 32
@@ -200,18 +195,16 @@ class PlanetConfig(RunConfig):
         return self
 
     @property
-    def limits(self) -> dict[str, float]:
-        """Options of the environment."""
-        drift_km = self.drift * self.max_move_km
-        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
+    def drift_km(self) -> float:
+        """How much farther than its command a current may carry a vehicle [km]."""
+        return self.drift * self.max_move_km
 
     @property
     def regions(self) -> dict[str, Any]:
         """Options of the regions: large enough for the longest task, and how the distances are drawn."""
         far = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
         size = far if self.distance_range_km[1] > 500 else {"max_latitude": 70}
-        reach_km = self.max_move_km + self.limits["drift_km"]
-        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
+        return {"distance_range_km": self.distance_range_km, "max_move_km": self.max_move_km + self.drift_km, **size}
 
     def motion(self, seed: int) -> list[Transform]:
         """Return the errors of motion: the current, if there is one."""

@@ -369,7 +369,7 @@ def test_options_replace_those_of_the_scenario() -> None:
     scenario = Scenario(max_steps=80, zeta=0.02)
     env = GeomagneticNavEnv(scenario, zeta=0.5, max_turn_deg=60, arrival="distance", radius_km=30)
     assert (env.max_steps, env.zeta, env.max_move_km, env.start_heading) == (80, 0.5, 50.0, "north")
-    assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.radians(60), "distance", 30.0)
+    assert (env.max_turn_rad, env.arrival, env.scenario.radius_km) == (math.radians(60), "distance", 30.0)
     assert (env.scenario.max_steps, env.scenario.zeta, scenario.zeta) == (80, 0.5, 0.02)
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'speed'; the options are .*'max_steps'"):
         GeomagneticNavEnv(speed=3)

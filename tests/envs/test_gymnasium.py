@@ -148,8 +148,8 @@ def test_tasks_on_planets_end_by_distance() -> None:
     planets = planet_scenario(1, seed=0)
     for task, make_env in NAMED_ENVS.items():
         options = {} if task in ("box", "nogo") else {"scenario": planets}
-        assert make_env(1, **options).arrival.rule == ("distance" if options else "objective")
-    assert NAMED_ENVS["storm"](1, scenario=planets.replace(arrival="objective")).arrival.rule == "objective"
+        assert make_env(1, **options).arrival == ("distance" if options else "objective")
+    assert NAMED_ENVS["storm"](1, scenario=planets.replace(arrival="objective")).arrival == "objective"
 
 
 @pytest.mark.parametrize("task", ["readings", "storm"])

@@ -137,7 +137,7 @@ def test_settings_of_a_training_are_read_from_the_file_of_the_policy(env: Geomag
     assert training_settings(texts, zeta=None) == (settings, [])
     note = f"zeta is 0.5, in training 0.02 (gg_td3={one}), 0.02 (gg_td3_noise={other})"
     assert training_settings(texts, zeta=0.5) == (settings | {"zeta": 0.5}, [note])
-    with pytest.raises(ValueError, match=r"trained with different scenario, .* \(gg_td3=.*c\): choose with --scenario"):
+    with pytest.raises(ValueError, match=r"trained with different zeta, .* \(gg_td3=.*c\): choose with --zeta"):
         training_settings([*texts, f"gg_td3={plain}"])
     with pytest.raises(ValueError, match=rf"{plain} was trained as gg_td3, not td3: write gg_td3={plain}"):
         training_settings([f"td3={plain}"])

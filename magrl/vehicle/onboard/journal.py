@@ -155,7 +155,7 @@ class Journal(Inputs):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[15] = 15
+    format: Literal[16] = 16
     options: Annotated[Options, _LAX]
     target: Annotated[tuple[float, ...], _LAX]
     target_elements: Triple | None = None

@@ -77,7 +77,7 @@ class Onboard:
         check_type((str, nn.Module), navigator=navigator)
         rules, self._network, self._other = _source(navigator)
         given = Options(**rules.model_dump() | USUAL | options)
-        most = rules.model_dump(include={"max_move_km", "max_turn_rad"}) if self._network else {}
+        most = rules.model_dump(include={"max_move_km", "max_turn_deg"}) if self._network else {}
         name, module = "anywhere" if self._network else "kalman", self._network or nn.Identity()
         self._range = ((-180.0, -90.0, limits.LEAST_NT), (180.0, 90.0, math.inf))
         if self._other:
