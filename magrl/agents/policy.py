@@ -22,7 +22,7 @@ from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
-from magrl.checks import check_finite, check_type
+from magrl.checks import check_device, check_finite, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.scenario import rule_settings
 from magrl.files import save_tensors, write_atomically
@@ -256,6 +256,7 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
         Traceback (most recent call last):
         FileNotFoundError: there is no policy file at policy.safetensors
     """
+    check_device(device)
     if Path(path).suffix == ".onnx" and Path(path).is_file():
         return _load_onnx(path).to(device).eval()
     content = policy_content(path)

@@ -20,7 +20,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance, paper
-from magrl.checks import check_choice, check_number, check_type
+from magrl.checks import check_choice, check_device, check_number, check_type
 from magrl.counters import counter_stream
 from magrl.envs import specs
 from magrl.envs.regions import Regions, one_region
@@ -121,6 +121,7 @@ class GeomagneticNavEnv(EnvBase):
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
             raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {options}")
         check_choice(("cpu", "cuda", "xpu"), device=str(device or "cpu").partition(":")[0])  # those with float64
+        check_device(device or "cpu")
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
@@ -195,6 +196,7 @@ class GeomagneticNavEnv(EnvBase):
 
     def to(self, device: Any) -> Self:
         """Move the environment to a device."""
+        check_device(device)
         self._ahead = None
         return super().to(device)
 

@@ -19,7 +19,7 @@ from magrl.tracking.planning import CAUTION, STEP_PRICE
 from magrl.tracking.way import DestinationPosterior, Way
 
 FARTHEST_START_KM = 100.0
-"""Largest error of a known start [km]: over longer distances, the field is not linear in the place."""
+"""Largest error of a known place or a leg [km]: over longer distances, the field is not linear in the place."""
 _Std = Annotated[float, Field(ge=0)]
 
 
@@ -97,7 +97,7 @@ class Rules(EpisodeRules):
     caution: Annotated[float, Field(ge=0)] = CAUTION
     model: EarthModel | None = None
     start_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
-    target_km: Annotated[float | None, Field(ge=0)] = None
+    target_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
     target_std: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] | None = (0.0, 0.0, 0.0)
     drift: Annotated[float, Field(ge=0, le=1)] = 0.0
     wander_km: Annotated[float, Field(ge=0)] = 0.0

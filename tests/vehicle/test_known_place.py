@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 from support.tracks import f64
 
+from magrl import tracking
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
 from magrl.sensor_std import SensorStd
@@ -142,3 +144,62 @@ def test_a_fix_is_restored_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
             fresh.start(target, date="2026-06-30")
         with pytest.raises(RuntimeError, match="start with a place and a date"):
             fresh.fix(60.4, 4.6, 1.0)
+
+
+# Limits
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: sailed(distance_std=1e5), r"distance_std must be less than or equal to 100, got 100000\.0"),
+        (lambda: sailed(distance_std=60.0), r"distance_std 60 km is more than a leg of 40 km allows, 41 km"),
+        (lambda: sailed(fixed=(60.4, 4.6, 1e18)), "std_km must be less than or equal to 100, got 1e[+]18"),
+        (lambda: begun(target_km=1e18), "target_km must be less than or equal to 100, got 1e[+]18"),
+        (lambda: begun(start_km=101.0), r"start_km must be less than or equal to 100, got 101\.0"),
+    ],
+)
+def test_errors_of_places_and_legs_have_limits(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_an_estimate_that_is_not_finite_is_refused_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    (vehicle, _), (other, _) = sailed(), sailed()
+    step, right = {"heading": 270.0, "distance": 40.0}, tracking.advance
+
+    def wrong(*given: Any) -> Any:
+        track = right(*given)
+        return track._replace(state=track.state._replace(mean=track.state.mean * float("nan")))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tracking, "advance", wrong)
+        with pytest.raises(ValueError, match=r"the estimate is not finite after this leg: check its distance"):
+            vehicle.step(*at(0.0, -120.0), **step)
+    assert vehicle.step(*at(0.0, -120.0), **step) == other.step(*at(0.0, -120.0), **step)
+
+
+@pytest.mark.parametrize(("std_km", "reset"), [(1.0, True), (99.0, False)])
+def test_only_a_fix_that_is_better_than_the_estimate_resets_the_fit(std_km: float, reset: bool) -> None:
+    vehicle, commands = flown(30.0, -30.0, 30.0, 0.0)
+    assert commands[-1].fit < 0.01
+    vehicle.fix(*commands[-1].place, std_km=std_km)
+    assert (vehicle.step(*at(112.0), heading=0.0).fit > 0.01) == reset
+
+
+@pytest.mark.parametrize(("latitude", "stop"), [(-86.0, "out of range"), (86.0, "out of range"), (-84.0, None)])
+def test_a_place_near_a_pole_is_out_of_range(latitude: float, stop: str | None) -> None:
+    """Of the Earth, in the north as in the south."""
+    here, there = ((latitude - turn, -60.0) for turn in (0.0, math.copysign(1.0, latitude)))
+    vehicle = begun(target=there, start=here)
+    assert vehicle.step(*elements_at(FIELD, f64(*here)).tolist(), heading=0.0).stop == stop
+
+
+def test_a_weak_horizontal_field_is_no_limit_where_the_place_is_known() -> None:
+    """Near the magnetic pole; without a place it is refused."""
+    here, there = (-65.6, 137.0), (-66.0, 138.0)
+    elements, target = (elements_at(FIELD, f64(*place)).tolist() for place in (here, there))
+    assert elements[2] < 2000 > target[2]
+    assert begun(target=there, start=here).step(*elements, heading=0.0).stop is None
+    with pytest.raises(ValueError, match=r"the target: B_H .* is out of the range of the navigator, 2000 to inf nT"):
+        begun(target=there, start=None)

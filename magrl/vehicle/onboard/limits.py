@@ -40,6 +40,10 @@ LEAST_NT = 2000.0
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
 of the longest legs [km]. Coarse readings of one element can stay equal that long; chosen."""
+ANYWHERE = ((-180.0, -90.0, 0.0), (180.0, 90.0, math.inf))
+"""Least and greatest D [deg], I [deg], B_H [nT] of a reading."""
+LEAST_LEG_STD_KM = 1.0
+"""Error that any leg may have, beside its length [km]; chosen."""
 LONGER = 1.1
 """A leg may be as many times as long as the longest one that is commanded."""
 
@@ -172,6 +176,34 @@ length explains at most 5000 nT: the reading is wrong, or the distance is
 
 
 # The vehicle and its sensors
+
+
+def check_leg(distance: float, distance_std: float, longest: float) -> None:
+    """Raise unless a vehicle can have flown a leg and know its length so well.
+
+    Args:
+        distance: length of the leg [km].
+        distance_std: its standard deviation [km].
+        longest: longest leg that is commanded [km].
+
+    Raises:
+        ValueError: naming the value, the limit and the unit.
+
+    Example:
+        >>> check_leg(40.0, 500.0, 50.0)
+        Traceback (most recent call last):
+        ValueError: distance_std 500 km is more than a leg of 40 km allows, 41 km: it must be in kilometers
+    """
+    if distance > LONGER * longest:
+        raise ValueError(
+            f"distance {distance:g} km is longer than the longest leg of this vehicle, {longest:g} km: it must be in "
+            "kilometers, and since the last step; report a longer distance in parts, with None between"
+        )
+    if distance_std > (most := distance + LEAST_LEG_STD_KM):
+        raise ValueError(
+            f"distance_std {distance_std:g} km is more than a leg of {distance:g} km allows, {most:g} km: it must be "
+            "in kilometers"
+        )
 
 
 def out_of_range(limits: Sequence[Sequence[float]], elements: Sequence[float]) -> str:

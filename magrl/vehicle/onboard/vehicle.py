@@ -21,6 +21,7 @@ from magrl.checks import check_type
 from magrl.files import write_atomically
 from magrl.sensor_std import OUTAGE_STD
 from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
+from magrl.tracking.belief import PLACE
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
@@ -141,9 +142,11 @@ class Onboard:
         given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
         journal = Journal(options=self.options, **given)
         rules, template = known_at_start(journal)
-        if text := limits.out_of_range(self._range, template.target.tolist()):
+        free = rules.start_km is not None and not (self._network or self._other)  # a filter with a place and a model
+        within = limits.ANYWHERE if free else self._range
+        if text := limits.out_of_range(within, template.target.tolist()):
             raise ValueError(f"the target: {text}")
-        self._journal, self._rules, self._template = journal, rules, template
+        self._journal, self._rules, self._template, self._within = journal, rules, template, within
         self._steps: tuple[Step | Fix, ...] = ()
         self._number = 0  # of steps without fixes
         self._state: State | None = None
@@ -195,7 +198,7 @@ class Onboard:
 
     def fix(self, latitude: float, longitude: float, std_km: float) -> None:
         """Take in a fix of the position, such as a bearing, a sounding or a moment of satellite navigation, which
-        counts from the next step on.
+        counts from the next step on. One that is better than the estimate ends a doubt (``fit``).
 
         Args:
             latitude: of the vehicle at the end of the last leg [deg].
@@ -209,7 +212,9 @@ class Onboard:
         fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
         if self._template is None or self._state is None or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
-        self._state, self._doubt = fixed(self._state, fix), Doubt()
+        better = std_km**2 < self._state.belief.covariance[PLACE, PLACE].trace().item()
+        self._state = fixed(self._state, fix)
+        self._doubt = Doubt() if better else self._doubt
         self._steps += (fix,)
 
     def _after(self, step: Step) -> Command:
@@ -228,6 +233,8 @@ class Onboard:
                 self._other = self._other and self._other.begun(self.options, reading)
             else:
                 track = tracking.advance(self._rules, self._state, reading)
+            if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
+                raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             action, decision = self._act(track, reading)
         if (reading.known is not None or self._state is not None) and read[1:] != (None, None):
             self._doubt = self._doubt.after(track, first=self._state is None)
@@ -265,19 +272,14 @@ class Onboard:
 
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
-        longest = self.options.max_move_km
-        if step.distance > limits.LONGER * longest:
-            raise ValueError(
-                f"distance {step.distance:g} km is longer than the longest leg of this vehicle, {longest:g} km: it "
-                "must be in kilometers, and since the last step; report a longer distance in parts, with None between"
-            )
+        limits.check_leg(step.distance, step.distance_std, self.options.max_move_km)
         if self._state is not None:
             since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
             limits.check_earth_jump(self._last, elements, since_km, noise)
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
-        if text := limits.out_of_range(self._range, elements):
+        if text := limits.out_of_range(self._within, elements):
             raise ValueError(f"the reading at the start: {text}")
         longest = LONGEST_WAY_KM if self._network else self.options.max_steps * self.options.max_move_km
         limits.check_earth_distance(elements, self.target, longest)
@@ -301,7 +303,7 @@ class Onboard:
         options, doubt = self.options, self._doubt
         if text := self._lost(track):
             return "lost", text
-        if text := limits.out_of_range(self._range, self._last):
+        if text := limits.out_of_range(self._within, self._last):
             return "out of range", text
         if self._rules.start_km is not None and abs(latitude := track.state.place[0].item()) > HIGHEST_LATITUDE:
             return "out of range", f"latitude {latitude:.1f}: the model is valid to {HIGHEST_LATITUDE:g} degrees"
