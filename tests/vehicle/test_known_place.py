@@ -13,7 +13,7 @@ from support.tracks import f64
 from magrl import tracking
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
-from magrl.sensor_std import SensorStd
+from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import Motion, earth_model
 from magrl.tracking.belief import PLACE, at_place, settled, updated
 from magrl.tracking.pilot import position_fix
@@ -203,3 +203,31 @@ def test_a_weak_horizontal_field_is_no_limit_where_the_place_is_known() -> None:
     assert begun(target=there, start=here).step(*elements, heading=0.0).stop is None
     with pytest.raises(ValueError, match=r"the target: B_H .* is out of the range of the navigator, 2000 to inf nT"):
         begun(target=there, start=None)
+
+
+# Elements that are not read
+
+
+@pytest.mark.parametrize(("off", "least", "most"), [(0.0, 0.5, 1.0), (0.6, 0.0, 0.1), (1.5, 0.0, 0.01)])
+def test_declination_alone_is_doubted(off: float, least: float, most: float) -> None:
+    """Five legs with D so many degrees off, at a stated .02; a part may be an anomaly."""
+    vehicle = begun(target=(61.4, 5.3))
+    vehicle.step(*at(0.0), heading=0.0)
+    for number in range(1, 6):
+        command = vehicle.step(at(10.0 * number)[0] + off, None, None, heading=0.0, distance=10.0)
+    assert least <= command.fit <= most
+
+
+def test_elements_that_are_not_read_count_neither_in_the_tail_nor_in_the_surprise() -> None:
+    """As where they are missing (NaN), whatever the others are."""
+    d, i, h = at(10.0)
+    tracks = []
+    for missing, noise in ((i, OUTAGE_STD), (float("nan"), 0.02)):
+        vehicle = begun(target=(61.4, 5.3))
+        vehicle.step(*at(0.0), heading=0.0)
+        reading = vehicle._template._replace(field=f64(d + 0.3, missing, h).float(), distance=torch.tensor(10.0))
+        reading = reading._replace(std=reading.std._replace(noise=f64(0.02, noise, 2.0)), step=torch.tensor(1))
+        tracks.append(tracking.advance(vehicle._rules, vehicle._state, reading))
+    outage, absent = tracks
+    assert outage.surprise.item() == pytest.approx(absent.surprise.item(), rel=1e-3)
+    assert outage.tail.item() == pytest.approx(absent.tail.item(), rel=1e-3)

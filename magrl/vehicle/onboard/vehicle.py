@@ -236,7 +236,7 @@ class Onboard:
             if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
                 raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             action, decision = self._act(track, reading)
-        if (reading.known is not None or self._state is not None) and read[1:] != (None, None):
+        if (reading.known is not None or self._state is not None) and any(x is not None for x in step.elements):
             self._doubt = self._doubt.after(track, first=self._state is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
