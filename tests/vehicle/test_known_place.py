@@ -231,3 +231,40 @@ def test_elements_that_are_not_read_count_neither_in_the_tail_nor_in_the_surpris
     outage, absent = tracks
     assert outage.surprise.item() == pytest.approx(absent.surprise.item(), rel=1e-3)
     assert outage.tail.item() == pytest.approx(absent.tail.item(), rel=1e-3)
+
+
+# A sensor that hangs
+
+
+def hung(*names: int, noise: float = 0.01) -> list[Command]:
+    """Commands of a vehicle on its way, whose sensors show some elements as at its start from the third reading on."""
+    vehicle = Onboard("kalman", sensor_std=(noise, noise, 100 * noise), confidence=0.9)
+    vehicle.start((62.6, 5.3), BERGEN, date=DATE)
+    commands, last = [], at(0.0)
+    for number in range(6):
+        read = at(40.0 * number)
+        last = [old if number > 1 and k in names else new for k, (old, new) in enumerate(zip(last, read, strict=True))]
+        commands.append(vehicle.step(*last, heading=0.0, distance=40.0 * (number > 0)))
+    return commands
+
+
+@pytest.mark.parametrize("element", [1, 2])
+def test_an_element_of_a_sensor_that_hangs_is_not_read_any_more(element: int) -> None:
+    """The operator is told, the others go on, and the place stays right; a change that noise hides is none."""
+    commands, name = hung(element), ("D", "I", "B_H")[element]
+    assert [command.reason for command in commands[:2]] == ["", ""]
+    for number, command in enumerate(commands[2:], 2):
+        assert command.reason == f"{name} stayed the same along a leg that changes it: it is not read any more"
+        assert command.stop is None
+        assert abs(command.place[0] - at_km(40.0 * number)) < 0.02
+    assert not any("not read" in command.reason for command in (*hung(), *hung(element, noise=1.0)))
+
+
+def test_a_vehicle_whose_sensors_all_hang_is_lost() -> None:
+    assert [command.stop for command in hung(0, 1, 2)][:2] == [None, None]
+    assert "lost" in [command.stop for command in hung(0, 1, 2)]
+
+
+def at_km(north_km: float) -> float:
+    """The latitude so far north of Bergen."""
+    return move_place(f64(*BERGEN), f64(0.0)[0], f64(north_km)[0])[0].item()

@@ -256,18 +256,22 @@ def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Inc
     return first, second, third
 
 
-def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
+def stuck(unchanged: Sequence[float], max_move_km: float, useful: Sequence[bool], hung: Sequence[bool]) -> str:
     """Return which readings are from a stuck sensor, as text; empty if none is.
 
     Args:
-        unchanged: from :func:`unchanged_km`; 0 for an element that is not measured.
+        unchanged: from :func:`unchanged_km`.
         max_move_km: longest leg.
+        useful: which elements are measured.
+        hung: which of them are not read any more: they end a flight only if all are stuck.
 
     Example:
-        >>> stuck((450.0, 20.0, 0.0), max_move_km=50.0)
+        >>> stuck((450.0, 20.0, 0.0), 50.0, (True, True, False), (False, False, False))
         'no change of D over 400 km: a sensor is stuck'
     """
     every_km, one_km = (max(km, moves * max_move_km) for km, moves in zip(STUCK_KM, (2, 8), strict=True))
-    least_km = every_km if min(unchanged) >= every_km else one_km
-    names = [name for name, km in zip(NAMES, unchanged, strict=True) if km >= least_km]
+    rows = list(zip(NAMES, unchanged, useful, hung, strict=True))
+    every = min((km for _, km, use, _ in rows if use), default=0.0) >= every_km
+    least_km = every_km if every else one_km
+    names = [name for name, km, use, off in rows if use and km >= least_km and (every or not off)]
     return f"no change of {', '.join(names)} over {least_km:.0f} km: a sensor is stuck" if names else ""

@@ -214,18 +214,20 @@ class Onboard:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
         better = std_km**2 < self._state.belief.covariance[PLACE, PLACE].trace().item()
         self._state = fixed(self._state, fix)
-        self._doubt = Doubt() if better else self._doubt
+        self._doubt = Doubt(hung=self._doubt.hung) if better else self._doubt
         self._steps += (fix,)
 
     def _after(self, step: Step) -> Command:
         """Return what to do after a new leg."""
-        read = self._comparable(step.elements)
+        doubt = self._doubt.found(self._state, self.options.sensor_std.noise, self._last, step)
+        read = [None if hung else value for hung, value in zip(doubt.hung, step.elements, strict=True)]
+        some, read = read != [None, None, None], self._comparable(read)
         last = self._last or read
         elements: Any = tuple(old if new is None else new for new, old in zip(read, last, strict=True))
         limits.check_earth_reading(*elements)
         self._check(step, elements)
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
-        reading = self._reading(step, elements, course)
+        reading = self._reading(step, read, elements, course)
         with torch.inference_mode():
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
@@ -236,16 +238,16 @@ class Onboard:
             if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
                 raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             action, decision = self._act(track, reading)
-        if (reading.known is not None or self._state is not None) and any(x is not None for x in step.elements):
-            self._doubt = self._doubt.after(track, first=self._state is None)
-        self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
+        if some and (reading.known is not None or self._state is not None):
+            doubt = doubt.after(track, first=self._state is None)
+        self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
-        self._last, self._state = elements, track.state
+        self._last, self._state, self._doubt = elements, track.state, doubt
         return self._command(track, decision, action, course)
 
-    def _reading(self, step: Step, elements: limits.Triple, course: float) -> Reading:
+    def _reading(self, step: Step, read: limits.Incomplete, elements: limits.Triple, course: float) -> Reading:
         """Return the reading of the pilot; a missing element is the last one, with the accuracy of an outage."""
-        missing = torch.tensor([value is None for value in self._comparable(step.elements)])
+        missing = torch.tensor([value is None for value in read])
         std = self._template.std
         distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
         leg = step.distance_std, step.distance * math.radians(step.heading_std)
@@ -290,6 +292,7 @@ class Onboard:
         stop, reason = self._stop(track, decision, radius)
         if not (stop or self._steps or self._template.known is not None):
             reason = _UNCHECKED[self.options.north]
+        reason = reason if stop else self._doubt.text or reason
         distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
         steer = math.degrees(course + turn) % 360.0
         north, east = track.way.displacement.tolist()
@@ -309,10 +312,7 @@ class Onboard:
             return "out of range", f"latitude {latitude:.1f}: the model is valid to {HIGHEST_LATITUDE:g} degrees"
         way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
         if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
-            return (
-                "out of range",
-                f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}",
-            )
+            return "out of range", f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}"
         if not decision.declare.item() or doubt.level > LOST_SURPRISE:
             return None, ""
         if decision.probability.item() >= options.confidence:
@@ -331,8 +331,7 @@ class Onboard:
         """Return why readings or legs cannot be from a vehicle, as text; empty if they can."""
         useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
-        unchanged = [km * use for km, use in zip(self._unchanged, useful, strict=True)]
-        if text := limits.stuck(unchanged, self.options.max_move_km):
+        if text := limits.stuck(self._unchanged, self.options.max_move_km, useful, self._doubt.hung):
             return text
         if self._doubt.lost:
             causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
