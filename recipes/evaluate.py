@@ -23,7 +23,6 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +30,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magrl.envs import load_scenario, named_tasks
+from magrl.envs.scenario import RULES
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
@@ -200,14 +200,10 @@ def settings(config: Config, flight: Flight) -> dict[str, Any]:
         "num_tasks": env.num_envs,
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
-        "arrival": env.arrival.rule,
-        "radius_km": env.arrival.radius_km,
-        "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
         "north": north(flight),
         **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
-        **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
-        **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
+        **env.scenario.model_dump(include={*RULES, "altitude_km"}),
     }
 
 
@@ -221,7 +217,7 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
     env = flight.base
     text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
     lines = {
-        "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
+        "Arrival": env.arrival != "objective" and f"{env.arrival}, within {env.scenario.radius_km:g} km",
         "North": north(flight) != "true" and north(flight),
         "Conditions": isinstance(config.errors, str) and config.errors,
         "Model of the Earth": config.model or "",

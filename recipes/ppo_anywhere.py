@@ -22,9 +22,10 @@ from magrl import Anywhere, paper
 from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
+from magrl.envs.scenario import rule_settings
 from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, Discount, Noise, NonNegative, PlanetConfig, Positive, Rising, Threshold, Widths
+from magrl.training.config import Count, Discount, Noise, NonNegative, PlanetConfig, Positive, Rising, Widths
 from magrl.training.run import make_collector
 from magrl.transforms import (
     DeclareArrival,
@@ -61,7 +62,7 @@ TRANSITION = (
 )
 
 
-class Config(PlanetConfig):
+class Config(rule_settings("zeta", "arrival", "radius_km", "max_move_km", "max_turn_deg", max_steps=120), PlanetConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["far", "fast"] = "far"
@@ -74,16 +75,9 @@ class Config(PlanetConfig):
     gamma: Discount = 0.999
     num_regions: Count = 2048
     distance_range_km: Rising = (150.0, 1800.0)
-    max_steps: Count = 120
     epochs: Count = 3
     batch_size: Count = 16_384
 
-    zeta: Threshold = 0.01
-    """Arrival threshold on the objective (Eq. 2-7), below 3."""
-    max_move_km: Positive = 50.0
-    """Longest leg [km]."""
-    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """Largest turn to either side before a leg [deg]."""
     drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
     noise: Noise = (0.0, 0.0, 0.0)
@@ -92,10 +86,6 @@ class Config(PlanetConfig):
     """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
     num_cells: Widths = (128, 128, 128)
     """Width of each hidden layer."""
-    arrival: Literal["objective", "declared"] = "objective"
-    """Rule of arrival: by the objective, or declared by the vehicle within ``radius_km``."""
-    radius_km: Positive = 25.0
-    """Distance from the destination within which a declaration is correct [km]."""
     range_km: Positive = RANGE_KM
     """Prior standard deviation of the displacement to the destination along each axis [km]."""
     price_range: Rising = (0.1, 30.0)
@@ -175,9 +165,7 @@ def train(config: Config) -> dict[str, float]:
     torch.manual_seed(config.seed)
     with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
         # Environments
-        options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
-        options |= {"device": config.device, "arrival": config.arrival, "radius_km": config.radius_km}
-        options |= config.limits
+        options = config.rules | {"start_heading": "random", "drift_km": config.drift_km, "device": config.device}
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
         others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)

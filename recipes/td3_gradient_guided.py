@@ -19,6 +19,7 @@ from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import guidance_pair, task_transforms
+from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
 from magrl.registry import NAMED_TASKS
 from magrl.training import Run, command, parse_config
@@ -47,10 +48,10 @@ from torchrl.modules import AdditiveGaussianModule
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_noise")
-ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
+ENV_OPTIONS = {"objective_limit", "device"}
 
 
-class Config(RegionConfig):
+class Config(rule_settings("start_heading"), RegionConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
@@ -61,8 +62,6 @@ class Config(RegionConfig):
     """Gradient guidance: the theoretical heading and its alignment reward."""
 
     # Environment
-    start_heading: Literal["north", "random"] = "north"
-    """Heading at the start of an episode."""
     distance_cost: NonNegative = 0.0
     """Cost of a leg [1/km]; 0.1 in presets fast and nogo, none in the paper."""
     objective_limit: Positive | None = None
@@ -208,7 +207,7 @@ def train(config: Config) -> dict[str, float]:
     name += f"-{config.task}" if config.task not in ("box", config.preset) else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        options = {**config.model_dump(include=ENV_OPTIONS), **NAMED_TASKS[config.task].options}
+        options = config.rules | config.model_dump(include=ENV_OPTIONS) | dict(NAMED_TASKS[config.task].options)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
         validation, test = run.evaluation_envs(*of_the_task(config), **options)
         observed = config.model_dump(include={"observe_heading", "observe_difference"})

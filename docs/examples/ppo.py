@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, NonNegative, Positive, RegionConfig, Share
@@ -45,7 +45,7 @@ NEXT = ("observation", "reward", "done", "terminated")
 TRANSITION = ("observation", "action", "action_log_prob", *(("next", k) for k in NEXT))
 
 
-class Config(RegionConfig):
+class Config(rule_settings("start_heading"), RegionConfig):
     """Settings of a training."""
 
     # Own defaults of shared settings
@@ -55,8 +55,6 @@ class Config(RegionConfig):
     final_learning_rate: Positive = 2e-5
 
     # Environment
-    start_heading: Literal["north", "random"] = "north"
-    """Heading at the start of an episode."""
     distance_cost: NonNegative = 0.1
     """Cost of a leg [1/km]."""
     alignment_weight: float = 3.0
@@ -132,7 +130,7 @@ def train(config: Config) -> dict[str, float]:
     torch.manual_seed(config.seed)
     with Run(config, recipe=RECIPE, name="ppo", losses=LOSSES) as run:
         # Environments
-        options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
+        options = config.rules | {"device": config.device}
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
         validation, test = run.evaluation_envs(**options)
         view = base.observation_view()

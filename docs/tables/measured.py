@@ -24,7 +24,7 @@ from magrl.tracking import Belief, before, destination, known, moved, posterior,
 from magrl.tracking.destination import log_density
 from magrl.training import command
 from magrl.vehicle.logs import read_readings
-from magrl.vehicle.onboard.known import MODEL_STD
+from magrl.vehicle.mistakes import MODEL_STD
 
 import torch
 import tyro

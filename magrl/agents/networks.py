@@ -86,7 +86,7 @@ class CorrectedMove(nn.Module):
         rules: limits of the leg.
 
     Example:
-        >>> CorrectedMove(Rules(max_turn_rad=1.5))(torch.tensor([25.0, 0.0]), torch.zeros(1), torch.zeros(2))
+        >>> CorrectedMove(Rules())(torch.tensor([25.0, 0.0]), torch.zeros(1), torch.zeros(2))
         tensor([0., 0.])
     """
 

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
-from pydantic import AfterValidator, Field
+from pydantic import Field
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
@@ -22,9 +22,9 @@ from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
-from magrl.checks import CheckedModel, check_finite, check_type
+from magrl.checks import check_device, check_finite, check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.scenario import check_zeta
+from magrl.envs.scenario import rule_settings
 from magrl.files import save_tensors, write_atomically
 from magrl.navigators import Anywhere, Memory, Navigator
 from magrl.tracking.network import FILE_FORMAT, policy_content, save_pilot
@@ -74,7 +74,7 @@ class PolicyConfig:
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
 
 
-class TrainingSettings(CheckedModel):
+class TrainingSettings(rule_settings("zeta", "start_heading")):  # type: ignore[misc]
     """Settings of a training that an evaluation shares, as the file of its policy holds them; see ``RunConfig``.
 
     Raises:
@@ -88,8 +88,6 @@ class TrainingSettings(CheckedModel):
 
     guided: bool | None = None
     scenario: str | None = None
-    zeta: Annotated[float, AfterValidator(check_zeta)] = 0.01
-    start_heading: Literal["north", "random"] = "north"
     noise: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] = (0.0, 0.0, 0.0)
 
 
@@ -148,10 +146,8 @@ class FieldPolicy(Navigator):
         """
         view, base = self.view, getattr(env, "base_env", env)
         check_type(GeomagneticNavEnv, env=base)
-        if self.declares and not base.arrival.declared:
-            raise ValueError(
-                f"the policy declares its arrival: fly it with arrival 'declared', not {base.arrival.rule!r}"
-            )
+        if self.declares and not base.scenario.declared:
+            raise ValueError(f"the policy declares its arrival: fly it with arrival 'declared', not {base.arrival!r}")
         if isinstance(view, ObservationView):
             view.check_covers(base.field, base.region.grid(81).to(base.device))
         (move, turn), (longest, largest) = (
@@ -260,6 +256,7 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
         Traceback (most recent call last):
         FileNotFoundError: there is no policy file at policy.safetensors
     """
+    check_device(device)
     if Path(path).suffix == ".onnx" and Path(path).is_file():
         return _load_onnx(path).to(device).eval()
     content = policy_content(path)

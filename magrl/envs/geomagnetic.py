@@ -8,7 +8,6 @@ and the number of the episode that each vehicle is in.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Self
@@ -21,15 +20,16 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance, paper
-from magrl.checks import check_choice, check_number, check_type
+from magrl.checks import check_choice, check_device, check_number, check_type
 from magrl.counters import counter_stream
 from magrl.envs import specs
 from magrl.envs.regions import Regions, one_region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
-from magrl.envs.scenario import Arrival, Scenario
+from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
-from magrl.geodesy import displaced, move, polar, wrap_angle
+from magrl.geodesy import displaced, geodesic, move, polar, wrap_angle
+from magrl.tracking.records import EpisodeRules
 from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 from magrl.transforms.views import ObservationView
 
@@ -55,8 +55,7 @@ class GeomagneticNavEnv(EnvBase):
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
         seed: seed of tasks and start headings; a random one of those for trainings if None.
         device: device of the batch.
-        **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``,
-            ``max_move_km``, ``max_turn_deg``, ``zeta``, ``arrival``, ``radius_km`` or ``start_heading``.
+        **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``.
 
     Raises:
         TypeError: for an unknown option, with the list of options.
@@ -67,12 +66,21 @@ class GeomagneticNavEnv(EnvBase):
             heading and errors, so that an environment of few vehicles with other numbers repeats episodes of a larger
             one.
 
-    Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
-    move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``elapsed_steps`` ``(N, 1)``; and privileged ``position``,
-    ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
-    ``objective_weights`` ``(N, 3)``, the index of the region, ``region`` ``(N, 1)``, ``episode_stream`` ``(N, 1)``,
-    int64, of seed, vehicle and episode, for random numbers of transforms, and the terms of ``reward``,
-    ``reward_destination`` and ``reward_proximity`` ``(N, 1)``. Action ``(N, 2)``: distance [km], turn [rad].
+    Keys (``N = num_envs``; float32, but positions float64, and counts and indices int64):
+
+    - ``action`` ``(N, 2)``: distance [km] and turn [rad]; ``(N, 3)`` where the arrival is declared, by a number above 0
+    - ``field``, ``target_field`` ``(N, 3)``: D [deg], I [deg], B_H [nT], of the vehicle and of its destination
+    - ``move`` ``(N, 2)``: last leg, distance [km] and turn [rad]
+    - ``heading`` ``(N, 1)``: from true north [rad]
+    - ``elapsed_steps`` ``(N, 1)``
+    - ``declared`` ``(N, 1)``: bool, where the arrival is declared
+    - ``reward``, ``done``, ``terminated``, ``truncated`` ``(N, 1)``
+    - privileged: ``position``, ``target_position``, ``start_position`` ``(N, 2)``: latitude and longitude [deg]
+    - privileged: ``objective`` ``(N, 1)``: F; ``objective_weights`` ``(N, 3)``: of D, I, B_H
+    - privileged: ``success`` ``(N, 1)``: bool
+    - privileged: ``region`` ``(N, 1)``: index of the region
+    - privileged: ``episode_stream`` ``(N, 1)``: number of seed, vehicle and episode, for random numbers of transforms
+    - privileged: ``reward_destination``, ``reward_proximity`` ``(N, 1)``: terms of the reward
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=4, seed=0, max_steps=80)
@@ -113,6 +121,7 @@ class GeomagneticNavEnv(EnvBase):
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
             raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {options}")
         check_choice(("cpu", "cuda", "xpu"), device=str(device or "cpu").partition(":")[0])  # those with float64
+        check_device(device or "cpu")
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
@@ -128,11 +137,11 @@ class GeomagneticNavEnv(EnvBase):
     def _place(self, scenario: Scenario) -> None:
         """Keep the rules of a scenario, and its regions, tasks and field on the device of the batch."""
         self.scenario = scenario
-        self.max_steps, self.max_move_km = scenario.max_steps, float(scenario.max_move_km)
-        self.max_turn_rad = math.radians(scenario.max_turn_deg)
-        self.arrival = Arrival(scenario.arrival, float(scenario.zeta), float(scenario.radius_km))
-        self.zeta, self.start_heading = self.arrival.zeta, scenario.start_heading
-        high = self.max_move_km, self.max_turn_rad, *([1.0] if self.arrival.declared else [])
+        self.max_steps, self.max_move_km, self.max_turn_rad = (
+            getattr(scenario, name) for name in ("max_steps", "max_move_km", "max_turn_rad")
+        )
+        self.arrival, self.zeta, self.start_heading = scenario.arrival, scenario.zeta, scenario.start_heading
+        high = self.max_move_km, self.max_turn_rad, *([1.0] if scenario.declared else [])
         self.register_buffer("action_high", torch.tensor(high, dtype=torch.float64, device=self.device))
         self.register_buffer("action_low", torch.cat((self.action_high.new_zeros(1), -self.action_high[1:])))
         # Modules of the scenario stay where they are.
@@ -146,10 +155,8 @@ class GeomagneticNavEnv(EnvBase):
 
     @property
     def limits(self) -> dict[str, Any]:
-        """What a vehicle knows of the environment before it starts, as :class:`magrl.tracking.Rules` name it."""
-        names = ("max_move_km", "max_turn_rad", "max_steps", "zeta")
-        rule = {"arrival": self.arrival.rule, "radius_km": self.arrival.radius_km}
-        return {name: getattr(self, name) for name in names} | rule
+        """The rules that a vehicle knows before it starts, for :class:`magrl.tracking.Rules`."""
+        return self.scenario.model_dump(include=set(EpisodeRules.model_fields))
 
     def observation_view(self, **observed: bool) -> ObservationView:
         """Return what an agent observes of this environment, scaled to the range of the field over the region.
@@ -179,8 +186,8 @@ class GeomagneticNavEnv(EnvBase):
 
     def _make_specs(self, boxes: Regions) -> None:
         bounds = specs.field_bounds(self.field, boxes)
-        options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
-        self.observation_spec = self._batched(specs.observation_spec(specs.Limits(bounds, *options)))
+        limits = specs.Limits(bounds, self.scenario, len(self.region), self.drift_km)
+        self.observation_spec = self._batched(specs.observation_spec(limits))
         self.state_spec = specs.state_spec(self.observation_spec)
         self._constant_keys = [name for name, _ in self.state_spec.items() if specs.KEYS[name].constant]  # noqa: PERF102
         self.action_spec = self._batched(specs.float_bounds(self.action_low, self.action_high))
@@ -189,6 +196,7 @@ class GeomagneticNavEnv(EnvBase):
 
     def to(self, device: Any) -> Self:
         """Move the environment to a device."""
+        check_device(device)
         self._ahead = None
         return super().to(device)
 
@@ -276,48 +284,50 @@ class GeomagneticNavEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
-        heading, position, field, lost = self._moved(tensordict, action)
-        weights = tensordict["objective_weights"].double()
-        specs.check_state(weights)
-        objective = guidance.objective(field, tensordict["target_field"].double(), weights)
-        step = tensordict["elapsed_steps"] + 1
-        ended, right = self.arrival(action, objective, position, tensordict["target_position"])
-        arrived, terminated = right & ended & ~lost, ended | lost
+        specs.check_state(tensordict["objective_weights"])
+        moved, lost = self._moved(tensordict, action)
+        ended, arrived = self._arrival(tensordict, action, moved)
+        step, success, terminated = tensordict["elapsed_steps"] + 1, arrived & ended & ~lost, ended | lost
         truncated = (step >= self.max_steps) & ~terminated
-        after = TensorDict(
-            {
-                **{key: tensordict[key] for key in self._constant_keys},
-                "field": field.float(),
-                "move": action[:, :2].float(),
-                "heading": heading.float().unsqueeze(-1),
-                "elapsed_steps": step,
-                "position": position,
-                "objective": objective.float(),
-                "success": arrived,
-                **self._rewards(tensordict["objective"].double(), objective, step, arrived),
-                "done": terminated | truncated,
-                "terminated": terminated,
-                "truncated": truncated,
-                **({specs.DECLARED: ended} if self.arrival.declared else {}),
-            },
-            batch_size=tensordict.batch_size,
-            device=self.device,
-        )
-        self._tracks.add(after)
-        return after
+        ends = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated, "success": success}
+        if self.scenario.declared:
+            ends[specs.DECLARED] = ended
+        rewards = self._rewards(tensordict["objective"].double(), moved["objective"], step, success)
+        return self._recorded(tensordict, moved | ends | rewards | {"elapsed_steps": step})
 
-    def _moved(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, ...]:
-        """Return headings ``(N,)`` [rad], positions ``(N, 2)`` [deg], the field there, and who is lost ``(N, 1)``."""
+    def _moved(self, tensordict: TensorDictBase, action: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the keys that a leg changes, the objective in float64, and who is lost ``(N, 1)``."""
         distance, turn = action[:, :2].unbind(-1)
         before, region = tensordict["position"], tensordict["region"].squeeze(-1)
         heading = course = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
         if self.drift_km:
             distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
-        moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
-        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
-        position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
-        field = elements_at(self.field, position, region).float().double()
-        return heading, position, field, ~(was_inside & is_inside)
+        after = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, after)), region).unbind(0)
+        position = torch.where(was_inside, after, before)  # a lost vehicle stays where it was lost
+        field = elements_at(self.field, position, region).float()
+        target, weights = tensordict["target_field"].double(), tensordict["objective_weights"].double()
+        objective = guidance.objective(field.double(), target, weights)
+        values = {"field": field, "move": action[:, :2].float(), "heading": heading.float().unsqueeze(-1)}
+        return values | {"position": position, "objective": objective}, ~(was_inside & is_inside)
+
+    def _arrival(self, tensordict: TensorDictBase, action: Tensor, moved: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return whether the rule of arrival ends episodes, and whether that is right there, ``(N, 1)`` each."""
+        rules = self.scenario
+        if rules.arrival == "objective":
+            arrived = moved["objective"] < rules.zeta
+        else:
+            distance_km, _ = geodesic(*moved["position"].unbind(-1), *tensordict["target_position"].unbind(-1))
+            arrived = distance_km.unsqueeze(-1) <= rules.radius_km
+        return (action[:, 2:] > 0 if rules.declared else arrived), arrived
+
+    def _recorded(self, tensordict: TensorDictBase, values: dict[str, Tensor]) -> TensorDict:
+        """Return the state after a step, with the keys that a step leaves as they are, and keep it for pictures."""
+        constant = {key: tensordict[key] for key in self._constant_keys}
+        values["objective"] = values["objective"].float()
+        after = TensorDict(constant | values, batch_size=tensordict.batch_size, device=self.device)
+        self._tracks.add(after)
+        return after
 
     def _rewards(self, before: Tensor, objective: Tensor, step: Tensor, arrived: Tensor) -> dict[str, Tensor]:
         """Return the reward and its terms, ``(N, 1)``, from the objective before and after a move."""

@@ -7,10 +7,10 @@ import datetime
 import math
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 from torch import Tensor
 
 from magrl import guidance, paper
@@ -30,75 +30,10 @@ from magrl.field import (
 )
 from magrl.field.elements import elements_gradient
 from magrl.files import read_document
-from magrl.geodesy import geodesic
+from magrl.tracking.records import EpisodeRules
 
-MAX_OBJECTIVE = 3
-"""Largest objective F at the start: each of the three elements adds at most 1 (Eq. 2-6)."""
 FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
-
-
-def check_zeta(zeta: float) -> float:
-    """Return an arrival threshold on the objective; raise unless it lies between 0 and the largest F at the start.
-
-    Raises:
-        ValueError: with the value and the reason.
-
-    Example:
-        >>> check_zeta(5)
-        Traceback (most recent call last):
-        ValueError: zeta must be below 3, got 5: the objective F is at most 3 at the start, so every vehicle has arrived
-    """
-    check_number(0, above=True, zeta=zeta)
-    if zeta >= MAX_OBJECTIVE:
-        reason = f"the objective F is at most {MAX_OBJECTIVE} at the start, so every vehicle has arrived"
-        raise ValueError(f"zeta must be below {MAX_OBJECTIVE}, got {zeta!r}: {reason}")
-    return zeta
-
-
-class Arrival(NamedTuple):
-    """When an episode ends at a destination, and whether that is a success; see ``Scenario.arrival``.
-
-    Args:
-        rule: ``"objective"``: an episode ends where the objective F is below ``zeta``, which is a success.
-            ``"distance"``: it ends within ``radius_km`` of the destination, which is a success. ``"declared"``: it ends
-            with a leg whose third number is above 0, by which the vehicle declares that it has arrived. That is a
-            success within ``radius_km`` of the destination, and a false arrival elsewhere.
-        zeta: arrival threshold on the objective.
-        radius_km: largest distance from the destination of an arrival, or of a correct declaration [km].
-
-    Example:
-        >>> Arrival("declared", zeta=0.01, radius_km=25.0).declared
-        True
-    """
-
-    rule: str
-    zeta: float
-    radius_km: float
-
-    @property
-    def declared(self) -> bool:
-        """Whether the vehicle declares its arrival."""
-        return self.rule == "declared"
-
-    def __call__(self, action: Tensor, objective: Tensor, place: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Return whether episodes end with an arrival, and whether an arrival counts as a success there.
-
-        Args:
-            action: ``(N, 2)``, or ``(N, 3)`` by declaration.
-            objective: ``(N, 1)`` objective F at the vehicle's place.
-            place: ``(N, 2)`` latitude, longitude [deg].
-            target: ``(N, 2)`` destination [deg].
-
-        Returns:
-            ``(N, 1)`` bool each.
-        """
-        if self.rule == "objective":
-            arrived = objective < self.zeta
-        else:
-            distance_km, _ = geodesic(*place.unbind(-1), *target.unbind(-1))
-            arrived = distance_km.unsqueeze(-1) <= self.radius_km
-        return (action[:, 2:] > 0 if self.declared else arrived), arrived
 
 
 def numbers_validator(name: str, count: int) -> BeforeValidator:
@@ -174,10 +109,9 @@ def _mean_changes(field: FieldModel | FieldBank, region: Regions) -> Tensor:
     return FLOOR_KM * slopes.norm(dim=-1).flatten(1, 2).mean(1)
 
 
-class Scenario(CheckedModel):
-    """Where tasks lie, the field there, and how far apart their ends are; by default the paper's.
-
-    From ``max_steps`` on, the fields are the rules of an episode.
+class Scenario(EpisodeRules):
+    """Where tasks lie, the field there, how far apart their ends are, and the rules of an episode; by default the
+    paper's.
 
     Raises:
         ValueError: naming the value: for distances that the region cannot hold, a date outside the field model, an
@@ -218,20 +152,6 @@ class Scenario(CheckedModel):
     """Frozen tasks to fly instead of random ones; by default in region 0."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     """Names of the frozen tasks, or none."""
-    max_steps: Annotated[int, Field(ge=1, le=10**9)] = 50
-    """Moves after which an episode is truncated."""
-    max_move_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
-    """Longest leg [km]."""
-    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """Largest turn to either side before a leg [deg]."""
-    zeta: Annotated[float, AfterValidator(check_zeta)] = 0.01
-    """Arrival threshold on the objective, below 3, its largest value at the start."""
-    arrival: Literal["objective", "distance", "declared"] = "objective"
-    """Rule of arrival: the paper's, F below ``zeta``; a distance to the destination below ``radius_km``; or
-    ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has arrived with
-    this leg, which ends the episode."""
-    radius_km: Annotated[float, Field(gt=0)] = 25.0
-    """Distance from the destination of an arrival by distance, or of a correct declaration [km]."""
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode; ``"random"`` is uniform."""
 
@@ -352,6 +272,29 @@ class Scenario(CheckedModel):
             5
         """
         return self.replace(tasks=tasks, names=())
+
+
+RULES = (*EpisodeRules.model_fields, "start_heading", "margin_deg")
+"""Names of the rules of an episode among the fields of a :class:`Scenario`."""
+
+
+def rule_settings(*names: str, **defaults: Any) -> Any:
+    """Return a model with rules of an episode as :class:`Scenario` declares them, a base of the settings of a program.
+
+    Args:
+        names: names of :data:`RULES`.
+        **defaults: further rules, with other defaults than a scenario's.
+
+    Example:
+        >>> rule_settings("zeta", max_steps=120)()
+        Settings(zeta=0.01, max_steps=120)
+    """
+    fields: dict[str, Any] = {}
+    for name in (*names, *defaults):
+        rule: Any = Scenario.model_fields[name]
+        kind: Any = Annotated[(rule.annotation, *rule.metadata, Field(description=rule.description))]
+        fields[name] = kind, defaults.get(name, rule.default)
+    return create_model("Settings", __base__=CheckedModel, **fields)
 
 
 def _name(value: object) -> object:

@@ -14,6 +14,7 @@ from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
 from magrl.field.elements import measured_elements
+from magrl.tracking.records import EpisodeRules
 from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
@@ -35,34 +36,35 @@ class Limits(NamedTuple):
 
     Args:
         field: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
-        max_move_km: longest leg [km].
-        max_turn_rad: largest turn [rad].
+        rules: rules of an episode.
         num_regions: number of regions.
-        declared: whether vehicles declare their arrival.
         drift_km: how much farther than its command errors of motion may carry a vehicle [km].
 
     Example:
-        >>> Limits((torch.zeros(3), torch.ones(3)), 50.0, 1.5).move.space.low
-        tensor([ 0.0000, -1.5000])
+        >>> Limits((torch.zeros(3), torch.ones(3)), EpisodeRules()).move.space.low
+        tensor([ 0.0000, -1.5708])
     """
 
     field: tuple[Tensor, Tensor]
-    max_move_km: float
-    max_turn_rad: float
+    rules: EpisodeRules
     num_regions: int = 1
-    declared: bool = False
     drift_km: float = 0.0
+
+    @property
+    def declared(self) -> bool:
+        """Whether vehicles declare their arrival."""
+        return self.rules.declared
 
     @property
     def move(self) -> Bounded:
         """Spec of a leg: distance [km] and turn [rad]."""
-        highest = torch.tensor((self.max_move_km, self.max_turn_rad), dtype=torch.float32)
+        highest = torch.tensor((self.rules.max_move_km, self.rules.max_turn_rad), dtype=torch.float32)
         return float_bounds(highest * torch.tensor((0, -1)), highest)
 
     @property
     def displacement(self) -> Bounded:
         """Spec of a displacement from the end of a commanded leg to the end of the true one [km]."""
-        reach = 2 * self.max_move_km + self.drift_km
+        reach = 2 * self.rules.max_move_km + self.drift_km
         return Bounded(-reach, reach, (2,), dtype=torch.float64)
 
 
@@ -163,7 +165,7 @@ def observation_spec(limits: Limits) -> Composite:
     """Return the spec of what a vehicle observes after a step, privileged keys included.
 
     Example:
-        >>> observation_spec(Limits((torch.zeros(3), torch.ones(3)), 50.0, 1.5)).expand(4)["field"].shape
+        >>> observation_spec(Limits((torch.zeros(3), torch.ones(3)), EpisodeRules())).expand(4)["field"].shape
         torch.Size([4, 3])
     """
     return Composite({name: key.spec(limits).clone() for name, key in KEYS.items() if getattr(limits, key.needs)})
@@ -234,7 +236,7 @@ def state_spec(observation: Composite) -> Composite:
     """Return the spec of the keys that a step reads; a transform may overwrite the others, as ``field``.
 
     Example:
-        >>> limits = Limits((torch.zeros(3), torch.ones(3)), 50.0, 1.5)
+        >>> limits = Limits((torch.zeros(3), torch.ones(3)), EpisodeRules())
         >>> "field" in state_spec(observation_spec(limits)).keys()
         False
     """

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from typing_extensions import Doc
 
 from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import Scenario, Tasks, load_scenario, named_tasks
+from magrl.envs.scenario import RULES
 from magrl.envs.tasks import RANDOM_SETS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
@@ -16,38 +19,29 @@ FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
 """Seed of random tasks with --tasks-seed 0: beyond the seeds of trainings and of frozen sets."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScenarioOptions:
-    """Keys of a scenario that a command line can change; None for the file's values, or the defaults.
+CHANGEABLE = (*RULES, "altitude_km")
+"""Fields of a scenario that a command line can change."""
 
-    Example:
-        >>> ScenarioOptions(max_steps=80).changes()
-        {'max_steps': 80}
-    """
 
-    zeta: float | None = None
-    """Arrival threshold on the objective (Eq. 2-7); by default the runs' threshold, or 0.01 without runs."""
-    start_heading: Literal["north", "random"] | None = None
-    """Heading at the start of an episode; by default as in the runs, or north."""
-    arrival: Literal["objective", "distance", "declared"] | None = None
-    """Rule of arrival: F below --zeta (default), distance below --radius-km, or a declaration by the navigator."""
-    radius_km: float | None = None
-    """Arrival radius around the destination, for --arrival distance and declared [km]; 25 by default."""
-    max_steps: int | None = None
-    """Maximum number of legs in an episode; 50 by default."""
-    max_move_km: float | None = None
-    """Longest leg [km]; 50 by default."""
-    max_turn_deg: float | None = None
-    """Largest turn to either side before a leg [deg]; 90 by default."""
-    altitude_km: float | None = None
-    """Altitude above the ellipsoid, negative for a depth [km]; 0 by default."""
-    margin_deg: float | None = None
-    """Margin around the region for destinations and vehicles [deg]; 5 by default."""
+def _changes(options: Any) -> dict[str, Any]:
+    """Return the fields that are given."""
+    return {name: value for name in CHANGEABLE if (value := getattr(options, name)) is not None}
 
-    def changes(self) -> dict[str, Any]:
-        """Return the keys that are given."""
-        given = {field.name: getattr(self, field.name) for field in fields(ScenarioOptions)}
-        return {name: value for name, value in given.items() if value is not None}
+
+def _optional(name: str) -> tuple[str, Any, Any]:
+    field = Scenario.model_fields[name]
+    return name, Annotated[field.annotation | None, Doc(field.description or "")], None  # type: ignore[operator]
+
+
+ScenarioOptions: Any = make_dataclass(
+    "ScenarioOptions",
+    map(_optional, CHANGEABLE),
+    namespace={"changes": _changes},
+    frozen=True,
+    kw_only=True,
+)
+"""Settings of a command: :data:`CHANGEABLE`, each None for its value in the scenario's file or in the trainings, or its
+default."""
 
 
 def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | None = None, **changes: Any) -> Scenario:

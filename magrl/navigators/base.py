@@ -153,8 +153,12 @@ class Navigator(TensorDictModuleBase):
         Raises:
             ValueError: for an option out of its range, or an environment that the navigator cannot navigate in.
         """
-        bounds = {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
-        return cls(**bounds | cls.env_options(env, SensorStd.of(sensor_std)) | options)
+        return cls(**cls.bounds(env) | cls.env_options(env, SensorStd.of(sensor_std)) | options)
+
+    @staticmethod
+    def bounds(env: GeomagneticNavEnv) -> dict[str, Any]:
+        """Return the limits of an environment as the constructor names them."""
+        return {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
@@ -172,7 +176,7 @@ class Navigator(TensorDictModuleBase):
     def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:
         """Return what an environment needs for it: see :func:`policy_env`."""
         base, there = getattr(env, "base_env", env), MEMORY in env.observation_spec.keys()  # noqa: SIM118
-        declared = base.arrival.declared and not self.declares
+        declared = base.scenario.declared and not self.declares
         primer = [self.make_tensordict_primer(env)] if self.remembers and not there else []
         return primer + (track_transforms(env, Rules(**base.limits | rules)) if declared else [])
 

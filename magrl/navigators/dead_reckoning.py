@@ -56,7 +56,7 @@ class DeadReckoning(Navigator):
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
         """Return whether the arrival must be declared."""
-        return {"declares": env.arrival.declared}
+        return {"declares": env.scenario.declared}
 
     def fitted(self, env: GeomagneticNavEnv, rules: Mapping[str, Any]) -> DeadReckoning:
         """Return it with the vehicle's model of the Earth as its chart."""

@@ -12,12 +12,11 @@ from torchrl.envs import EnvBase, Transform
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import Navigator, track_transforms
-from magrl.sensor_std import SensorStd
 from magrl.tracking.network import load_pilot, pretrained
 from magrl.tracking.pilot import Rules, act
 from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, reading_of, track_of
 
-LIMITS = ("max_move_km", "max_turn_rad")
+LIMITS = ("max_move_km", "max_turn_deg")
 
 
 class Kalman(Navigator):
@@ -60,8 +59,8 @@ class Kalman(Navigator):
         return type(self)(self.rules.replace(**env.limits | dict(rules) | shorter), self.network)
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
-        """Return the limits of the environment."""
+    def bounds(env: GeomagneticNavEnv) -> dict[str, Any]:
+        """Return the rules that a vehicle knows."""
         return env.limits
 
     def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:

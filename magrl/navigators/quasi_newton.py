@@ -332,8 +332,8 @@ def search_options(env: GeomagneticNavEnv) -> dict[str, Any]:
         {'search': True, 'radius_km': 25.0}
     """
     return {
-        "search": not env.arrival.declared,
-        "radius_km": env.arrival.radius_km if env.arrival.rule == "distance" else None,
+        "search": not env.scenario.declared,
+        "radius_km": env.scenario.radius_km if env.arrival == "distance" else None,
     }
 
 

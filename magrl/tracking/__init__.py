@@ -45,6 +45,7 @@ from magrl.tracking.planning import corrected as corrected
 from magrl.tracking.planning import planned_move as planned_move
 from magrl.tracking.planning import sensor_length as sensor_length
 from magrl.tracking.planning import step_price as step_price
+from magrl.tracking.records import EpisodeRules as EpisodeRules
 from magrl.tracking.records import Reading as Reading
 from magrl.tracking.records import Rules as Rules
 from magrl.tracking.records import State as State

@@ -128,20 +128,20 @@ def reweighed(log_weight: Tensor, new: Innovation) -> Tensor:
     return torch.logaddexp(after + math.log1p(-CHANGES), prior_weights(after) + math.log(CHANGES))
 
 
-def tail(log_weight: Tensor, new: Innovation) -> Tensor:
+def tail(log_weight: Tensor, new: Innovation, count: Tensor) -> Tensor:
     """Return the probability ``(...)`` of a reading that is more surprising, where everything stated is true.
 
     Args:
         log_weight: ``(..., H)`` logarithms of the weights before the reading.
-        new: innovation of each belief, whose normalized square is chi-square of the elements present.
+        new: innovation of each belief, whose normalized square is chi-square of the elements that were read.
+        count: ``(..., 1)`` number of those.
 
     Example:
         >>> new = Innovation(torch.tensor([[0.0, 0.0, 3.0]]), torch.eye(3).unsqueeze(0), torch.eye(3).unsqueeze(0))
-        >>> tail(torch.zeros(1), new).round(decimals=3)
+        >>> tail(torch.zeros(1), new, torch.tensor([3])).round(decimals=3)
         tensor(0.0290)
     """
-    present = (new.rows != 0).any(-1).sum(-1).clamp_min(1) / 2
-    return (log_weight.exp() * torch.special.gammaincc(present.to(log_weight), new.square() / 2)).sum(-1)
+    return (log_weight.exp() * torch.special.gammaincc((count / 2).to(log_weight), new.square() / 2)).sum(-1)
 
 
 def joint_tail(tails: Sequence[float]) -> float:

@@ -347,7 +347,11 @@ def innovation(
     heading: Tensor | None = None,
     errors: bool = True,
 ) -> Innovation:
-    """Return a reading minus what the belief predicts; arguments as of :func:`read`.
+    """Return the innovation of a reading: residual y - H x, rows H, and covariance S = H P H^T + R.
+
+    x and P are mean and covariance of the belief. y is the vector of the field that was read, times the Jacobian of D,
+    I, B_H there, which is also the part of H for the field. R is the variance of the reading's noise, and of what the
+    model leaves out (:data:`MODEL_NT`). Arguments are those of :func:`read`.
 
     Args:
         belief: that before the reading.
@@ -377,9 +381,9 @@ def innovation(
         place = torch.zeros_like(rows[..., :4])
         rows = torch.cat((rows[..., :COEFFICIENTS], place, own, jacobian, jacobian @ turn), -1)
     rows = pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
-    residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)
+    residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)  # y - H x
     variance = torch.where(present, sensor_std, 1.0).square()
-    noise = torch.diag_embed(variance) + MODEL_NT**2 * jacobian @ jacobian.mT
+    noise = torch.diag_embed(variance) + MODEL_NT**2 * jacobian @ jacobian.mT  # R
     return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)
 
 

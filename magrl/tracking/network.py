@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,10 @@ def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
     """
     content = policy_content(path)
     try:
-        rules, cells, weights = Rules(**content.pop("rules")), content.pop("num_cells"), content.pop("weights")
+        stated, cells, weights = (content.pop(name) for name in ("rules", "num_cells", "weights"))
+        if "max_turn_rad" in stated:  # of an older file
+            stated["max_turn_deg"] = math.degrees(stated.pop("max_turn_rad"))
+        rules = Rules(**stated)
         # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
         network = correction_network(cells, "meta")
         network.load_state_dict(weights, assign=True)

@@ -27,7 +27,7 @@ from torch.nn.functional import pad
 
 from magrl.field.elements import element_difference
 from magrl.geodesy import geodesic, steer
-from magrl.sensor_std import SensorStd
+from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import anomalies
 from magrl.tracking.belief import (
     PLACE,
@@ -94,7 +94,7 @@ def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
     beliefs = updated(beliefs, innovation(beliefs, seen.field, first * wide, seen.heading))
     beliefs = anomalies.recentered(beliefs, log_weight)
     weights, home, quiet = arrival_weights(field, reading.target, rules.zeta), none[..., :2], 0 * beliefs.mean[..., :3]
-    after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new)
+    after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new, _count(beliefs, seen))
     rest = quiet, quiet, unvisited_yet(field), weights, home[..., 0], home, _declination(after, reading)
     return State(beliefs.mean, beliefs.covariance, after.place, log_weight, *rest), none[..., 0], tail
 
@@ -125,15 +125,22 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     wide = spike_factor(innovation(beliefs, field, scaled, heading), scaled)
     own = noise_estimate(own, innovation(beliefs, field, scaled * wide, heading), std * wide)
     new = innovation(beliefs, field, std * own.factor * wide, heading)
-    log_weight, tail = anomalies.reweighed(state.log_weight, new), anomalies.tail(state.log_weight, new)
+    log_weight, count = anomalies.reweighed(state.log_weight, new), _count(beliefs, seen)
+    tail = anomalies.tail(state.log_weight, new, count)
     beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
-    surprise = (state.log_weight.exp() * stated.square()).sum(-1) / beliefs.measured.squeeze(-2).sum(-1)
+    surprise = (state.log_weight.exp() * stated.square()).sum(-1) / count.squeeze(-1)
     after, heading = anomalies.mixture(beliefs, log_weight), one.heading
     move = reading.distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
     path, home, visited = state.path + reading.distance, state.home + move, visit(state.visited, move.to(state.visited))
     rest = visited, state.weights, path, home, _declination(after, reading)
     state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *own, *rest)
     return state, surprise, tail
+
+
+def _count(beliefs: Belief, seen: Reading) -> Tensor:
+    """Return the number ``(..., 1)`` of elements that were read, at least 1; noise as of an outage means none."""
+    read = (seen.std.noise < OUTAGE_STD) & (seen.field == seen.field) & beliefs.measured
+    return read.sum(-1).clamp_min(1)
 
 
 def _side_by_side(reading: Reading) -> Reading:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from torch import Tensor
 
 from magrl.checks import CheckedModel
@@ -19,21 +19,56 @@ from magrl.tracking.planning import CAUTION, STEP_PRICE
 from magrl.tracking.way import DestinationPosterior, Way
 
 FARTHEST_START_KM = 100.0
-"""Largest error of a known start [km]: over longer distances, the field is not linear in the place."""
+"""Largest error of a known place or a leg [km]: over longer distances, the field is not linear in the place."""
 _Std = Annotated[float, Field(ge=0)]
 
 
-class Rules(CheckedModel):
-    """What a vehicle knows before it starts: its limits, the rule of arrival, and what it expects of the field.
+class EpisodeRules(CheckedModel):
+    """Rules of an episode that a vehicle knows: the limits of a leg, and what ends the episode.
+
+    Each rule is declared here alone. Scenarios and :class:`Rules` inherit them, and commands and recipes take them from
+    there (:func:`magrl.envs.scenario.rule_settings`).
+
+    Raises:
+        ValueError: for a value out of its range, or an unknown name.
+
+    Example:
+        >>> EpisodeRules(max_turn_deg=180.0).max_turn_rad, EpisodeRules(arrival="declared").declared
+        (3.141592653589793, True)
+    """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    max_steps: Annotated[int, Field(ge=1, le=10**9)] = 50
+    """Legs after which an episode is truncated."""
+    max_move_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
+    """Longest leg [km]."""
+    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
+    """Largest turn to either side before a leg [deg]."""
+    zeta: Annotated[float, Field(gt=0, lt=3)] = 0.01
+    """Arrival threshold on the objective F (Eq. 2-7), below 3, its largest value at the start."""
+    arrival: Literal["objective", "distance", "declared"] = "objective"
+    """Rule of arrival: F below zeta (objective); a distance below radius_km (distance); or a third number of the
+    action, in [-1, 1], by which the vehicle declares above 0 that it has arrived (declared): that ends the episode,
+    within radius_km as a success and elsewhere as a false arrival."""
+    radius_km: Annotated[float, Field(gt=0)] = 25.0
+    """Distance from the destination of an arrival by distance, or of a correct declaration [km]."""
+
+    @property
+    def max_turn_rad(self) -> float:
+        """Largest turn [rad]."""
+        return math.radians(self.max_turn_deg)
+
+    @property
+    def declared(self) -> bool:
+        """Whether the vehicle declares its arrival; else, it gets a signal."""
+        return self.arrival == "declared"
+
+
+class Rules(EpisodeRules):
+    """What a vehicle knows before it starts: the rules of the episode, and what it expects of the field.
 
     Args:
-        max_move_km: longest leg [km].
-        max_turn_rad: largest turn before a leg [rad].
-        max_steps: step limit.
-        zeta: arrival threshold on the objective.
-        arrival: what ends the episode: the objective or the distance, with a signal at each step, or a declaration by
-            the vehicle.
-        radius_km: distance from the destination that counts as arrived, but by the objective [km].
         confidence: minimum probability of a correct declaration; below it, episodes end without one.
         range_km: prior standard deviation of the displacement to the destination along each axis [km].
         step_price: price of a step [% of SPL]: a higher one gives fewer steps and a longer path.
@@ -56,19 +91,13 @@ class Rules(CheckedModel):
         False
     """
 
-    max_move_km: Annotated[float, Field(gt=0)] = 50.0
-    max_turn_rad: Annotated[float, Field(gt=0, le=math.pi)] = math.pi / 2
-    max_steps: Annotated[int, Field(ge=1)] = 50
-    zeta: Annotated[float, Field(gt=0)] = 0.01
-    arrival: Literal["objective", "distance", "declared"] = "objective"
-    radius_km: Annotated[float, Field(gt=0)] = 25.0
     confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
     range_km: Annotated[float, Field(gt=0)] = RANGE_KM
     step_price: Annotated[float, Field(gt=0)] = STEP_PRICE
     caution: Annotated[float, Field(ge=0)] = CAUTION
     model: EarthModel | None = None
     start_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
-    target_km: Annotated[float | None, Field(ge=0)] = None
+    target_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
     target_std: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] | None = (0.0, 0.0, 0.0)
     drift: Annotated[float, Field(ge=0, le=1)] = 0.0
     wander_km: Annotated[float, Field(ge=0)] = 0.0
@@ -93,7 +122,7 @@ class Rules(CheckedModel):
     @property
     def signaled(self) -> bool:
         """Whether the vehicle gets an arrival signal, so that the destination is not where it has been."""
-        return self.arrival != "declared"
+        return not self.declared
 
 
 class Reading(NamedTuple):

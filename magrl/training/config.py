@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from magrl import paper
 from magrl.checks import CheckedModel, UsageError, check_device, printable, short
 from magrl.envs import Scenario, load_scenario
-from magrl.envs.scenario import check_zeta
+from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document
 from magrl.training.loggers import Logger, WandbMode, check_logger
 
@@ -26,7 +26,6 @@ PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Discount = Annotated[float, Field(ge=0, lt=1)]
 Widths = Annotated[tuple[Count, ...], Field(min_length=1)]
 Seed = Annotated[int, Field(ge=0, lt=paper.FIRST_RESERVED_SEED)]
-Threshold = Annotated[float, AfterValidator(check_zeta)]
 Noise = tuple[NonNegative, NonNegative, NonNegative]
 
 
@@ -111,7 +110,7 @@ class RunConfig(CheckedModel):
         return end + remaining * (start - end)
 
 
-class RegionConfig(RunConfig):
+class RegionConfig(rule_settings("zeta"), RunConfig):  # type: ignore[misc]
     """Settings of recipes that train in the region of a scenario.
 
     Raises:
@@ -124,8 +123,6 @@ class RegionConfig(RunConfig):
 
     scenario: Path | None = None
     """Scenario file (.toml or .json) of region, date and altitude (docs/data.md); the paper's by default."""
-    zeta: Threshold = 0.01
-    """Arrival threshold on the objective (Eq. 2-7), below 3."""
     noise: Noise = (0.0, 0.0, 0.0)
     """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT], in training and evaluations."""
     num_cells: Widths = (128, 128, 128)
@@ -139,9 +136,8 @@ class RegionConfig(RunConfig):
             scenario = self.load_scenario()
         except OSError as error:
             raise ValueError(str(error)) from None
-        for name in ("zeta", "start_heading", "max_steps"):
-            given, value = scenario.given(name), getattr(self, name, None)
-            if None not in (given, value) and given != value:
+        for name, value in self.rules.items():
+            if (given := scenario.given(name)) not in (None, value):
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"the scenario sets {name} = {given!r}, the training {value!r}: add {option} {given}")
         if scenario.arrival == "declared":
@@ -153,8 +149,13 @@ class RegionConfig(RunConfig):
         """Return the scenario of the file, or the paper's."""
         return Scenario() if self.scenario is None else load_scenario(self.scenario)
 
+    @property
+    def rules(self) -> dict[str, Any]:
+        """Rules of an episode among the settings, which replace the scenario's."""
+        return self.model_dump(include=set(RULES))
 
-class PlanetConfig(RunConfig):
+
+class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
     """Settings of PPO recipes that train on random planets and learn corrections of legs.
 
     Example:
@@ -170,8 +171,6 @@ class PlanetConfig(RunConfig):
     """Number of training regions, two on each random planet."""
     distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a task [km]."""
-    max_steps: Count = 50
-    """Legs after which an episode is truncated."""
     steps_per_batch: Count = 32
     """Steps of each vehicle in a collected batch."""
     epochs: Count = 8

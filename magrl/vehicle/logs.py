@@ -20,7 +20,7 @@ from magrl.field.elements import FIELD_NT, NAMES, element_difference, measured_e
 from magrl.files import numbers, read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.sensor_std import OUTAGE_STD
-from magrl.vehicle.onboard.known import deviation, likely_mistake, model_std
+from magrl.vehicle.mistakes import deviation, likely_mistake, model_std
 
 Array = NDArray[np.float64]
 
@@ -287,7 +287,7 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     """Return the likely mistakes in a log with positions, as sentences; none where it fits.
 
     Readings are compared with IGRF, within the accuracy of a model of the core
-    (:data:`~magrl.vehicle.onboard.known.MODEL_STD`), and legs with the positions.
+    (:data:`~magrl.vehicle.mistakes.MODEL_STD`), and legs with the positions.
 
     Args:
         readings: columns of :func:`read_readings`. Where D is not measured (``D_std``), it converts

@@ -65,7 +65,7 @@ def test_readings_of_a_track_are_frozen(name: str) -> None:
         flight = track.flight(errors, num_envs=4)
         moves = iter(torch.from_numpy((actions(4, 8) + FIRST) * SIZE).float())
 
-        def act(seen, moves=moves, declares=flight.base.arrival.declared):
+        def act(seen, moves=moves, declares=flight.base.scenario.declared):
             return seen.set("action", torch.nn.functional.pad(next(moves), (0, int(declares)), value=-1))
 
         flight.base.max_steps = 8

@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+from collections.abc import Callable
 from datetime import datetime
 from itertools import pairwise
 from typing import Any
@@ -17,11 +18,14 @@ from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
+from magrl.agents import load_policy
 from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.envs.navigation import navigation_env
 from magrl.envs.specs import REWARD_TERMS
+from magrl.evaluation import Flight
 from magrl.field import IGRF, RegionalField
 from magrl.geodesy import move
+from magrl.tracking.network import pretrained
 
 ANTIMERIDIAN = Region((-5.0, 5.0), (175.0, 185.0))
 
@@ -369,7 +373,7 @@ def test_options_replace_those_of_the_scenario() -> None:
     scenario = Scenario(max_steps=80, zeta=0.02)
     env = GeomagneticNavEnv(scenario, zeta=0.5, max_turn_deg=60, arrival="distance", radius_km=30)
     assert (env.max_steps, env.zeta, env.max_move_km, env.start_heading) == (80, 0.5, 50.0, "north")
-    assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.radians(60), "distance", 30.0)
+    assert (env.max_turn_rad, env.arrival, env.scenario.radius_km) == (math.radians(60), "distance", 30.0)
     assert (env.scenario.max_steps, env.scenario.zeta, scenario.zeta) == (80, 0.5, 0.02)
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'speed'; the options are .*'max_steps'"):
         GeomagneticNavEnv(speed=3)
@@ -437,3 +441,17 @@ def test_a_step_traces_as_one_graph() -> None:
     before = env.rand_action(env.reset())
     traced, plain = torch.compile(env._step, fullgraph=True, backend="eager")(before), env._step(before)
     assert_same(traced, plain)
+
+
+@pytest.mark.parametrize(
+    "door",
+    [
+        lambda device: GeomagneticNavEnv(device=device),
+        lambda device: GeomagneticNavEnv().to(device),
+        lambda device: load_policy(pretrained("anywhere"), device),
+        lambda device: Flight(Scenario(), device=device),
+    ],
+)
+def test_a_device_that_is_not_there_is_refused(door: Callable[[str], object]) -> None:
+    with pytest.raises(ValueError, match=r"device 'cuda:99' cannot be used here .*: choose another, such as cpu"):
+        door("cuda:99")

@@ -20,7 +20,6 @@ from magrl import Anywhere, episode_measures, evaluate, evaluation_rollout, summ
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.envs.measures import path_efficiency, path_measures, spl
-from magrl.envs.scenario import check_zeta
 from magrl.evaluation.episodes import (
     bootstrap_interval,
     first_episode_mask,
@@ -229,7 +228,7 @@ def test_bad_values_are_named() -> None:
         (lambda: summarize({"success": torch.ones(2)}), "success must be bool"),
         (lambda: summarize({"success": torch.ones(2, 2) > 0}), "success must be bool of shape"),
         (lambda: summarize({"success": torch.ones(0) > 0}), "success must be bool of shape"),
-        *((partial(check_zeta, zeta), f"^zeta must be a finite number above 0, got {zeta}$") for zeta in (0, -1)),
+        *((partial(Scenario, zeta=zeta), f"^zeta must be greater than 0, got {zeta}$") for zeta in (0, -1)),
         (lambda: bootstrap_interval(torch.zeros(2, 2)), r"values must be of shape \(M,\).*\(2, 2\)"),
         (lambda: stratified_bootstrap([torch.ones(0)]), r"strata must each be of shape \(R,\)"),
         (lambda: stratified_bootstrap([]), r"strata must each be of shape \(R,\) with R >= 1, got \[\]"),

@@ -157,7 +157,7 @@ def test_settings_of_a_training_are_read_from_the_file_of_the_policy(env: Geomag
     assert training_settings(texts, zeta=None) == (settings, [])
     note = f"zeta is 0.5, in training 0.02 ({one}), 0.02 (B={other})"
     assert training_settings(texts, zeta=0.5) == (settings | {"zeta": 0.5}, [note])
-    with pytest.raises(ValueError, match=r"trained with different scenario, .* \(.*c\): choose with --scenario"):
+    with pytest.raises(ValueError, match=r"trained with different zeta, .* \(.*c\): choose with --zeta"):
         training_settings([*texts, f"{plain}"])
     save_policy(tmp_path / "pilot.safetensors", Anywhere(zeta=0.03))
     assert training_settings([f"{tmp_path / 'pilot.safetensors'}"]) == ({"zeta": 0.03}, [])

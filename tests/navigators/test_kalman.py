@@ -43,7 +43,7 @@ def test_every_navigator_declares(name: str) -> None:
 
 def test_moves_stay_within_the_limits_of_its_rules() -> None:
     env = GeomagneticNavEnv(num_envs=20, seed=0, start_heading="random")
-    agent = Anywhere(max_move_km=10.0, max_turn_rad=0.5)
+    agent = Anywhere(max_move_km=10.0, max_turn_deg=math.degrees(0.5))
     action = policy_env(env, agent).rollout(2, agent)["action"]
     assert 5 < action[..., 0].max() <= 10 + 1e-4
     assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from magrl.envs.scenario import RULES
+from magrl.tracking import EpisodeRules
+
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "magrl"
 
@@ -68,6 +71,27 @@ def test_no_cycle_among_modules() -> None:
         free = {module for module, needs in graph.items() if not needs & graph.keys()}
         assert free, f"a cycle among {sorted(graph)}"
         graph = {module: needs for module, needs in graph.items() if module not in free}
+
+
+# Rules of an episode
+
+
+OTHER_MEANINGS = {"journal.Options.arrival", "benchmark.Track.max_steps", "offline_dataset.Config.max_steps"}
+OTHER_MEANINGS |= {"fly.Config.max_steps", "fly.Config.zeta", "fly.Config.start_heading", "replay_log.Config.radius_km"}
+"""What a vehicle alone can do, frozen tasks, and defaults that follow from a flight."""
+
+
+def test_a_rule_of_an_episode_is_declared_in_one_class() -> None:
+    """With its default and its range: settings of any program inherit it."""
+    found = set()
+    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "recipes").glob("*.py"), *(ROOT / "docs").rglob("*.py")]:
+        for kind in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for node in kind.body if isinstance(kind, ast.ClassDef) else ():
+                if isinstance(node, ast.AnnAssign) and node.value and ast.unparse(node.target) in RULES:
+                    found.add(f"{path.stem}.{kind.name}.{ast.unparse(node.target)}")
+    declared = {f"records.EpisodeRules.{name}" for name in EpisodeRules.model_fields}
+    declared |= {f"scenario.Scenario.{name}" for name in set(RULES) - EpisodeRules.model_fields.keys()}
+    assert found == declared | OTHER_MEANINGS
 
 
 # Sizes

@@ -93,8 +93,8 @@ def test_the_api_has_the_names_that_pages_and_examples_import() -> None:
         own = re.findall(r"^(?:def |class )?(\w+)", inspect.getsource(module), re.MULTILINE)
         imported = [key for key, value in vars(module).items() if callable(value)]  # of a package, without its data
         shown |= set(members.split(", ") if members else imported if hasattr(module, "__path__") else own)
-    internal = {"CheckedModel", "Count", "NonNegative", "Positive", "Rising", "Seed", "Share"}  # of settings
-    assert {name.name for node in imports for name in node.names} - shown == internal
+    settings = {"CheckedModel", "Count", "NonNegative", "Positive", "Rising", "Seed", "Share", "rule_settings"}
+    assert {name.name for node in imports for name in node.names} - shown == settings
 
 
 def test_every_page_is_in_the_index() -> None:
@@ -289,7 +289,7 @@ def test_a_named_task_is_a_function_a_row_and_a_section(name: str, monkeypatch) 
     task, page = NAMED_TASKS[name], TEXTS[ROOT / "docs/tasks.md"]
     env, table = NAMED_ENVS[name](seed=0), rows("# Named tasks", "id, after `magrl/GeomagneticNavigation`", page)
     (row,) = [row for cell, row in table.items() if cell.endswith(f"(#{name})" + " (*Box*)" * (name == "box"))]
-    arrival = "within 25 km" if env.arrival.rule == "distance" else "F < 0.01"
+    arrival = "within 25 km" if env.arrival == "distance" else "F < 0.01"
     assert row[:3] == [f"`{task.make}`", str(env.max_steps), arrival]
     assert f"[`{task.id.removeprefix('magrl/GeomagneticNavigation')}`](#{name})" in page
     assert gymnasium.spec(task.id).reward_threshold == task.threshold

@@ -60,7 +60,7 @@ def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None
 def test_the_vehicle_is_that_of_the_settings() -> None:
     config = recipe.FAST.replace(max_move_km=10.0, max_turn_deg=20.0, drift=0.2)
     planets = planet_scenario(4, seed=3, **config.regions)
-    base = GeomagneticNavEnv(planets, num_envs=6, seed=5, **config.limits)
+    base = GeomagneticNavEnv(planets, num_envs=6, seed=5, drift_km=config.drift_km, **config.rules)
     rules = recipe.rules_of(base, config)
     assert (rules.max_move_km, math.degrees(rules.max_turn_rad)) == (10.0, pytest.approx(20.0))
     td = recipe.make_env(base, config).rollout(5)["next"]

@@ -78,7 +78,7 @@ def test_a_mixture_has_the_moments_of_its_beliefs() -> None:
 def test_tails_are_uniform_where_a_belief_is_right() -> None:
     square = randn(5000, 1, 3)
     new = Innovation(square, torch.ones(5000, 1, 3, STATES).double(), torch.eye(3).double().expand(5000, 1, 3, 3))
-    found = anomalies.tail(torch.zeros(5000, 1).double(), new)
+    found = anomalies.tail(torch.zeros(5000, 1).double(), new, torch.tensor([3]))
     assert all(abs((found < p).double().mean() - p) < 0.02 for p in (0.1, 0.5, 0.9))
     joint = [anomalies.joint_tail(some.tolist()) for some in found[:1000].split(8)]
     assert abs(sum(p < 0.3 for p in joint) / len(joint) - 0.3) < 0.1

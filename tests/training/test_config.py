@@ -28,7 +28,7 @@ def test_bad_settings_of_a_run(tmp_path: Path) -> None:
         ({"scenario": Path("nowhere.toml")}, "there is no scenario file at nowhere.toml"),
         ({"seed": paper.TEST_SEED}, "seed must be less than"),
         ({"total_frames": 0}, "total_frames must be greater than or equal to 1, got 0"),
-        ({"zeta": 3.0}, "zeta must be below 3, got 3"),
+        ({"zeta": 3.0}, "zeta must be less than 3, got 3"),
         ({"noise": (0.05, -0.05, 5.0)}, "noise.1 must be greater than or equal to 0, got -0.05"),
         ({"speed": 1}, "unknown key 'speed'"),
     ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,10 @@ import pytest
 import torch
 from support.tracks import f64
 
+from magrl import tracking
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
-from magrl.sensor_std import SensorStd
+from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import Motion, earth_model
 from magrl.tracking.belief import PLACE, at_place, settled, updated
 from magrl.tracking.pilot import position_fix
@@ -72,7 +74,7 @@ def test_the_elements_of_the_destination_count_where_they_are_given() -> None:
         vehicle = begun(target=place, start_km=5.0, model="IGRF-2020", **more)
         vehicle.step(*at(0.0), heading=60.0)
         ways.append(vehicle.step(*at(10.0, 17.3), heading=60.0, distance=20.0).confidence)
-        assert vehicle.target == pytest.approx(given, abs=1e-9) if more else vehicle.target != given
+        assert (vehicle.target == pytest.approx(given, rel=1e-6)) == bool(more)
     assert begun(target=given, start_km=5.0, target_std=(0.1, 0.1, 9.0))._rules.target_std == (0.1, 0.1, 9.0)
 
 
@@ -142,3 +144,127 @@ def test_a_fix_is_restored_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
             fresh.start(target, date="2026-06-30")
         with pytest.raises(RuntimeError, match="start with a place and a date"):
             fresh.fix(60.4, 4.6, 1.0)
+
+
+# Limits
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: sailed(distance_std=1e5), r"distance_std must be less than or equal to 100, got 100000\.0"),
+        (lambda: sailed(distance_std=60.0), r"distance_std 60 km is more than a leg of 40 km allows, 41 km"),
+        (lambda: sailed(fixed=(60.4, 4.6, 1e18)), "std_km must be less than or equal to 100, got 1e[+]18"),
+        (lambda: begun(target_km=1e18), "target_km must be less than or equal to 100, got 1e[+]18"),
+        (lambda: begun(start_km=101.0), r"start_km must be less than or equal to 100, got 101\.0"),
+    ],
+)
+def test_errors_of_places_and_legs_have_limits(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_an_estimate_that_is_not_finite_is_refused_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    (vehicle, _), (other, _) = sailed(), sailed()
+    step, right = {"heading": 270.0, "distance": 40.0}, tracking.advance
+
+    def wrong(*given: Any) -> Any:
+        track = right(*given)
+        return track._replace(state=track.state._replace(mean=track.state.mean * float("nan")))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tracking, "advance", wrong)
+        with pytest.raises(ValueError, match=r"the estimate is not finite after this leg: check its distance"):
+            vehicle.step(*at(0.0, -120.0), **step)
+    assert vehicle.step(*at(0.0, -120.0), **step) == other.step(*at(0.0, -120.0), **step)
+
+
+@pytest.mark.parametrize(("std_km", "reset"), [(1.0, True), (99.0, False)])
+def test_only_a_fix_that_is_better_than_the_estimate_resets_the_fit(std_km: float, reset: bool) -> None:
+    vehicle, commands = flown(30.0, -30.0, 30.0, 0.0)
+    assert commands[-1].fit < 0.01
+    vehicle.fix(*commands[-1].place, std_km=std_km)
+    assert (vehicle.step(*at(112.0), heading=0.0).fit > 0.01) == reset
+
+
+@pytest.mark.parametrize(("latitude", "stop"), [(-86.0, "out of range"), (86.0, "out of range"), (-84.0, None)])
+def test_a_place_near_a_pole_is_out_of_range(latitude: float, stop: str | None) -> None:
+    """Of the Earth, in the north as in the south."""
+    here, there = ((latitude - turn, -60.0) for turn in (0.0, math.copysign(1.0, latitude)))
+    vehicle = begun(target=there, start=here)
+    assert vehicle.step(*elements_at(FIELD, f64(*here)).tolist(), heading=0.0).stop == stop
+
+
+def test_a_weak_horizontal_field_is_no_limit_where_the_place_is_known() -> None:
+    """Near the magnetic pole; without a place it is refused."""
+    here, there = (-65.6, 137.0), (-66.0, 138.0)
+    elements, target = (elements_at(FIELD, f64(*place)).tolist() for place in (here, there))
+    assert elements[2] < 2000 > target[2]
+    assert begun(target=there, start=here).step(*elements, heading=0.0).stop is None
+    with pytest.raises(ValueError, match=r"the target: B_H .* is out of the range of the navigator, 2000 to inf nT"):
+        begun(target=there, start=None)
+
+
+# Elements that are not read
+
+
+@pytest.mark.parametrize(("off", "least", "most"), [(0.0, 0.5, 1.0), (0.6, 0.0, 0.1), (1.5, 0.0, 0.01)])
+def test_declination_alone_is_doubted(off: float, least: float, most: float) -> None:
+    """Five legs with D so many degrees off, at a stated .02; a part may be an anomaly."""
+    vehicle = begun(target=(61.4, 5.3))
+    vehicle.step(*at(0.0), heading=0.0)
+    for number in range(1, 6):
+        command = vehicle.step(at(10.0 * number)[0] + off, None, None, heading=0.0, distance=10.0)
+    assert least <= command.fit <= most
+
+
+def test_elements_that_are_not_read_count_neither_in_the_tail_nor_in_the_surprise() -> None:
+    """As where they are missing (NaN), whatever the others are."""
+    d, i, h = at(10.0)
+    tracks = []
+    for missing, noise in ((i, OUTAGE_STD), (float("nan"), 0.02)):
+        vehicle = begun(target=(61.4, 5.3))
+        vehicle.step(*at(0.0), heading=0.0)
+        reading = vehicle._template._replace(field=f64(d + 0.3, missing, h).float(), distance=torch.tensor(10.0))
+        reading = reading._replace(std=reading.std._replace(noise=f64(0.02, noise, 2.0)), step=torch.tensor(1))
+        tracks.append(tracking.advance(vehicle._rules, vehicle._state, reading))
+    outage, absent = tracks
+    assert outage.surprise.item() == pytest.approx(absent.surprise.item(), rel=1e-3)
+    assert outage.tail.item() == pytest.approx(absent.tail.item(), rel=1e-3)
+
+
+# A sensor that hangs
+
+
+def hung(*names: int, noise: float = 0.01) -> list[Command]:
+    """Commands of a vehicle on its way, whose sensors show some elements as at its start from the third reading on."""
+    vehicle = Onboard("kalman", sensor_std=(noise, noise, 100 * noise), confidence=0.9)
+    vehicle.start((62.6, 5.3), BERGEN, date=DATE)
+    commands, last = [], at(0.0)
+    for number in range(6):
+        read = at(40.0 * number)
+        last = [old if number > 1 and k in names else new for k, (old, new) in enumerate(zip(last, read, strict=True))]
+        commands.append(vehicle.step(*last, heading=0.0, distance=40.0 * (number > 0)))
+    return commands
+
+
+@pytest.mark.parametrize("element", [1, 2])
+def test_an_element_of_a_sensor_that_hangs_is_not_read_any_more(element: int) -> None:
+    """The operator is told, the others go on, and the place stays right; a change that noise hides is none."""
+    commands, name = hung(element), ("D", "I", "B_H")[element]
+    assert [command.reason for command in commands[:2]] == ["", ""]
+    for number, command in enumerate(commands[2:], 2):
+        assert command.reason == f"{name} stayed the same along a leg that changes it: it is not read any more"
+        assert command.stop is None
+        assert abs(command.place[0] - at_km(40.0 * number)) < 0.02
+    assert not any("not read" in command.reason for command in (*hung(), *hung(element, noise=1.0)))
+
+
+def test_a_vehicle_whose_sensors_all_hang_is_lost() -> None:
+    assert [command.stop for command in hung(0, 1, 2)][:2] == [None, None]
+    assert "lost" in [command.stop for command in hung(0, 1, 2)]
+
+
+def at_km(north_km: float) -> float:
+    """The latitude so far north of Bergen."""
+    return move_place(f64(*BERGEN), f64(0.0)[0], f64(north_km)[0])[0].item()

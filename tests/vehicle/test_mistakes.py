@@ -74,7 +74,7 @@ def test_elements_that_are_not_possible() -> None:
 MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] = [
     (Onboard, ("dowsing",), {}, "unknown navigator 'dowsing': choose anywhere"),
     (Onboard, (Geodesic(),), {}, "Geodesic reads position, target_position, which a vehicle does not know"),
-    (Onboard, (), {"radius": 5.0}, "unknown key 'radius': choose from max_move_km"),
+    (Onboard, (), {"radius": 5.0}, "unknown key 'radius': choose from max_steps"),
     (Onboard, (), {"sensor_std": (0.02, 0.02, 0.002)}, r"sensor_std.noise: 0.002 nT .*: it looks like microtesla"),
     (Onboard, (), {"sensor_std": SensorStd(bias=(0.1, 0.1, 0.02))}, "sensor_std.bias: 0.02 nT .* give 0 for a perfect"),
     (Onboard, (), {"sensor_std": (1e5, 0.1, 1.0)}, "sensor_std.noise must be at most 10000, as in an outage"),
@@ -145,7 +145,7 @@ def test_a_mistake_is_named(row: int, tmp_path: Path, monkeypatch) -> None:
 
 BAD: tuple[Any, ...] = ("73", True, np.bool_(True), [73.0], torch.tensor([73.0]), math.nan, -math.inf, 1e9, -1e9)
 """Of no number's type, not finite, or beyond what any vehicle has."""
-OPTIONS = {"max_move_km": 50.0, "max_turn_rad": 1.0, "max_steps": 9, "radius_km": 9.0, "confidence": 0.5}
+OPTIONS = {"max_move_km": 50.0, "max_turn_deg": 60.0, "max_steps": 9, "radius_km": 9.0, "confidence": 0.5}
 OPTIONS |= {"range_km": 400.0, "north": "true", "sensor_std": NOISE}
 STEP = {"declination": 3.5, "inclination": 73.0, "horizontal_intensity": 15e3, "heading": 290.0, "distance": 0.0}
 
@@ -153,7 +153,7 @@ STEP = {"declination": 3.5, "inclination": 73.0, "horizontal_intensity": 15e3, "
 def test_options_of_a_wrong_type_or_out_of_range_are_named() -> None:
     Onboard("kalman", **OPTIONS)
     for name in OPTIONS:
-        for value in BAD[: -2 if name not in ("max_turn_rad", "confidence", "north", "sensor_std") else None]:
+        for value in BAD[: -2 if name not in ("max_turn_deg", "confidence", "north", "sensor_std") else None]:
             with pytest.raises(ValueError, match=name):
                 Onboard("kalman", **OPTIONS | {name: value})
 

@@ -19,6 +19,7 @@ from magrl.checks import CheckedModel
 from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
 from magrl.tracking import Rules, State, Way
 from magrl.tracking.belief import CONSTANT, DRIFT, PLACE
+from magrl.tracking.records import FARTHEST_START_KM
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
@@ -123,7 +124,7 @@ class Step(Inputs):
     horizontal_intensity: float | None
     heading: float = Field(ge=-360, le=360)
     distance: float = Field(0.0, ge=0)
-    distance_std: float = Field(0.0, ge=0)
+    distance_std: float = Field(0.0, ge=0, le=FARTHEST_START_KM)
     heading_std: float = Field(0.0, ge=0, le=180)
 
     @property
@@ -143,7 +144,7 @@ class Fix(Inputs):
 
     latitude: float = Field(ge=-90, le=90)
     longitude: float = Field(ge=-360, le=360)
-    std_km: float = Field(gt=0)
+    std_km: float = Field(gt=0, le=FARTHEST_START_KM)
 
 
 class Journal(Inputs):
@@ -155,7 +156,7 @@ class Journal(Inputs):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[15] = 15
+    format: Literal[16] = 16
     options: Annotated[Options, _LAX]
     target: Annotated[tuple[float, ...], _LAX]
     target_elements: Triple | None = None
@@ -165,8 +166,8 @@ class Journal(Inputs):
     date: str | None = None
     altitude_km: float = 0.0
     model: str | None = None
-    start_km: float = Field(0.1, ge=0)
-    target_km: float = Field(0.1, ge=0)
+    start_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
+    target_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
     steps: Annotated[tuple[Annotated[Step, _LAX] | Annotated[Fix, _LAX], ...], _LAX] = ()
 
     @classmethod

@@ -40,6 +40,10 @@ LEAST_NT = 2000.0
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
 of the longest legs [km]. Coarse readings of one element can stay equal that long; chosen."""
+ANYWHERE = ((-180.0, -90.0, 0.0), (180.0, 90.0, math.inf))
+"""Least and greatest D [deg], I [deg], B_H [nT] of a reading."""
+LEAST_LEG_STD_KM = 1.0
+"""Error that any leg may have, beside its length [km]; chosen."""
 LONGER = 1.1
 """A leg may be as many times as long as the longest one that is commanded."""
 
@@ -174,6 +178,34 @@ length explains at most 5000 nT: the reading is wrong, or the distance is
 # The vehicle and its sensors
 
 
+def check_leg(distance: float, distance_std: float, longest: float) -> None:
+    """Raise unless a vehicle can have flown a leg and know its length so well.
+
+    Args:
+        distance: length of the leg [km].
+        distance_std: its standard deviation [km].
+        longest: longest leg that is commanded [km].
+
+    Raises:
+        ValueError: naming the value, the limit and the unit.
+
+    Example:
+        >>> check_leg(40.0, 500.0, 50.0)
+        Traceback (most recent call last):
+        ValueError: distance_std 500 km is more than a leg of 40 km allows, 41 km: it must be in kilometers
+    """
+    if distance > LONGER * longest:
+        raise ValueError(
+            f"distance {distance:g} km is longer than the longest leg of this vehicle, {longest:g} km: it must be in "
+            "kilometers, and since the last step; report a longer distance in parts, with None between"
+        )
+    if distance_std > (most := distance + LEAST_LEG_STD_KM):
+        raise ValueError(
+            f"distance_std {distance_std:g} km is more than a leg of {distance:g} km allows, {most:g} km: it must be "
+            "in kilometers"
+        )
+
+
 def out_of_range(limits: Sequence[Sequence[float]], elements: Sequence[float]) -> str:
     """Return which element is beyond the range that a navigator was trained or tested in; empty if none is.
 
@@ -224,18 +256,22 @@ def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Inc
     return first, second, third
 
 
-def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
+def stuck(unchanged: Sequence[float], max_move_km: float, useful: Sequence[bool], hung: Sequence[bool]) -> str:
     """Return which readings are from a stuck sensor, as text; empty if none is.
 
     Args:
-        unchanged: from :func:`unchanged_km`; 0 for an element that is not measured.
+        unchanged: from :func:`unchanged_km`.
         max_move_km: longest leg.
+        useful: which elements are measured.
+        hung: which of them are not read any more: they end a flight only if all are stuck.
 
     Example:
-        >>> stuck((450.0, 20.0, 0.0), max_move_km=50.0)
+        >>> stuck((450.0, 20.0, 0.0), 50.0, (True, True, False), (False, False, False))
         'no change of D over 400 km: a sensor is stuck'
     """
     every_km, one_km = (max(km, moves * max_move_km) for km, moves in zip(STUCK_KM, (2, 8), strict=True))
-    least_km = every_km if min(unchanged) >= every_km else one_km
-    names = [name for name, km in zip(NAMES, unchanged, strict=True) if km >= least_km]
+    rows = list(zip(NAMES, unchanged, useful, hung, strict=True))
+    every = min((km for _, km, use, _ in rows if use), default=0.0) >= every_km
+    least_km = every_km if every else one_km
+    names = [name for name, km, use, off in rows if use and km >= least_km and (every or not off)]
     return f"no change of {', '.join(names)} over {least_km:.0f} km: a sensor is stuck" if names else ""

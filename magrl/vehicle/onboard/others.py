@@ -75,9 +75,10 @@ class Other:
         keys: Any = self.navigator.in_keys
         if unknown := sorted({*map(str, keys)} - READS):
             raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")
-        view = getattr(self.navigator, "view", self.navigator)
-        moves = () if self._secant else ("max_move_km", "max_turn_rad")
-        self.most = {name: getattr(view, name) for name in moves if hasattr(view, name)}
+        view: Any = getattr(self.navigator, "view", self.navigator)
+        self.most: dict[str, float] = {}
+        if hasattr(view, "max_turn_rad") and not self._secant:
+            self.most = {"max_move_km": view.max_move_km, "max_turn_deg": math.degrees(view.max_turn_rad)}
         self.range = getattr(view, "field_limits", ((-180.0, -90.0, 0.0), (180.0, 90.0, math.inf)))
 
     def begun(self, options: Options, reading: Reading) -> Other:

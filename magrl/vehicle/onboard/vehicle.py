@@ -19,13 +19,14 @@ from torch import Tensor, nn
 from magrl import tracking
 from magrl.checks import check_type
 from magrl.files import write_atomically
-from magrl.sensor_std import OUTAGE_STD, SensorStd
+from magrl.sensor_std import OUTAGE_STD
 from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
+from magrl.tracking.belief import PLACE
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
-from magrl.vehicle.onboard.known import Knowledge, check_first_reading, fixed
+from magrl.vehicle.onboard.known import check_first_reading, fixed, known_at_start
 
 USUAL: dict[str, Any] = {
     "arrival": "declared",
@@ -71,14 +72,13 @@ class Onboard:
         (0.0, None)
     """
 
-    target: Any = None
-    """Elements at the destination; None before :meth:`start`."""
+    _template: Any = None  # a Reading with what the vehicle knows at the start
 
     def __init__(self, navigator: str | nn.Module = "anywhere", **options: Any) -> None:
         check_type((str, nn.Module), navigator=navigator)
         rules, self._network, self._other = _source(navigator)
         given = Options(**rules.model_dump() | USUAL | options)
-        most = rules.model_dump(include={"max_move_km", "max_turn_rad"}) if self._network else {}
+        most = rules.model_dump(include={"max_move_km", "max_turn_deg"}) if self._network else {}
         name, module = "anywhere" if self._network else "kalman", self._network or nn.Identity()
         self._range = ((-180.0, -90.0, limits.LEAST_NT), (180.0, 90.0, math.inf))
         if self._other:
@@ -88,6 +88,11 @@ class Onboard:
         shorter = {limit: min(getattr(given, limit), value) for limit, value in most.items()}
         content = b"".join(value.cpu().numpy().tobytes() for value in module.state_dict().values())
         self.options = given.replace(**shorter, navigator=name, weights=hashlib.sha256(content).hexdigest())
+
+    @property
+    def target(self) -> Any:
+        """Elements at the destination; None before :meth:`start`."""
+        return None if self._template is None else tuple(self._template.target.tolist())
 
     def start(
         self,
@@ -136,15 +141,12 @@ class Onboard:
         given |= {"target_elements": target_elements, "target_std": target_std}
         given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
         journal = Journal(options=self.options, **given)
-        known = Knowledge.of(journal)
-        limits.check_earth_reading(*known.target, what="the target")
-        if text := limits.out_of_range(self._range, known.target):
+        rules, template = known_at_start(journal)
+        free = rules.start_km is not None and not (self._network or self._other)  # a filter with a place and a model
+        within = limits.ANYWHERE if free else self._range
+        if text := limits.out_of_range(within, template.target.tolist()):
             raise ValueError(f"the target: {text}")
-        rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
-        self._journal, self._knowledge, self._rules = journal, known, rules
-        self.target = self._comparable(known.target)
-        self._known = known.elements and (self._comparable(known.elements), known.std)
-        self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
+        self._journal, self._rules, self._template, self._within = journal, rules, template, within
         self._steps: tuple[Step | Fix, ...] = ()
         self._number = 0  # of steps without fixes
         self._state: State | None = None
@@ -184,7 +186,7 @@ class Onboard:
             RuntimeError: before :meth:`start`.
             ValueError: for values that are not possible, naming the value and what would be right.
         """
-        if self.target is None:
+        if self._template is None:
             raise RuntimeError(_NOT_STARTED)
         if self.options.magnetic and declination is not None:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
@@ -196,7 +198,7 @@ class Onboard:
 
     def fix(self, latitude: float, longitude: float, std_km: float) -> None:
         """Take in a fix of the position, such as a bearing, a sounding or a moment of satellite navigation, which
-        counts from the next step on.
+        counts from the next step on. One that is better than the estimate ends a doubt (``fit``).
 
         Args:
             latitude: of the vehicle at the end of the last leg [deg].
@@ -208,49 +210,55 @@ class Onboard:
             ValueError: for a fix that does not fit the estimated place (p < 0.001).
         """
         fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
-        if self.target is None or self._state is None or self._rules.start_km is None:
+        if self._template is None or self._state is None or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
-        self._state, self._doubt = fixed(self._state, fix), Doubt()
+        better = std_km**2 < self._state.belief.covariance[PLACE, PLACE].trace().item()
+        self._state = fixed(self._state, fix)
+        self._doubt = Doubt(hung=self._doubt.hung) if better else self._doubt
         self._steps += (fix,)
 
     def _after(self, step: Step) -> Command:
         """Return what to do after a new leg."""
-        read = self._comparable(step.elements)
+        doubt = self._doubt.found(self._state, self.options.sensor_std.noise, self._last, step)
+        read = [None if hung else value for hung, value in zip(doubt.hung, step.elements, strict=True)]
+        some, read = read != [None, None, None], self._comparable(read)
         last = self._last or read
         elements: Any = tuple(old if new is None else new for new, old in zip(read, last, strict=True))
         limits.check_earth_reading(*elements)
         self._check(step, elements)
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
-        reading = self._reading(step, elements, course)
+        reading = self._reading(step, read, elements, course)
         with torch.inference_mode():
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
-                if self._known:
-                    there, std = self._known
-                    check_first_reading(elements, there, self.options.accuracy, std, track.tail.item())
+                check_first_reading(reading, track.tail.item())
                 self._other = self._other and self._other.begun(self.options, reading)
             else:
                 track = tracking.advance(self._rules, self._state, reading)
+            if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
+                raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             action, decision = self._act(track, reading)
-        if (self._known or self._state is not None) and read[1:] != (None, None):
-            self._doubt = self._doubt.after(track, first=self._state is None)
-        self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
+        if some and (reading.known is not None or self._state is not None):
+            doubt = doubt.after(track, first=self._state is None)
+        self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
-        self._last, self._state = elements, track.state
+        self._last, self._state, self._doubt = elements, track.state, doubt
         return self._command(track, decision, action, course)
 
-    def _reading(self, step: Step, elements: limits.Triple, course: float) -> Reading:
+    def _reading(self, step: Step, read: limits.Incomplete, elements: limits.Triple, course: float) -> Reading:
         """Return the reading of the pilot; a missing element is the last one, with the accuracy of an outage."""
-        rows = elements, self.target, *(self._known or ())
-        field, target, *there = torch.tensor(rows, dtype=torch.float32)
-        missing = torch.tensor([value is None for value in self._comparable(step.elements)])
-        std = self._std._replace(noise=self._std.noise.masked_fill(missing, OUTAGE_STD))
+        missing = torch.tensor([value is None for value in read])
+        std = self._template.std
         distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
-        known, known_std = there or (None, None)
-        reading = Reading(field, target, distance, heading, std, torch.tensor(self._number), known, known_std)
         leg = step.distance_std, step.distance * math.radians(step.heading_std)
-        leg_std = torch.tensor(leg, dtype=torch.float64) if any(leg) else None
-        return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place, leg_std=leg_std)
+        return self._template._replace(
+            field=torch.tensor(elements, dtype=torch.float32),
+            distance=distance,
+            heading=heading,
+            std=std._replace(noise=std.noise.masked_fill(missing, OUTAGE_STD)),
+            step=torch.tensor(self._number),
+            leg_std=torch.tensor(leg, dtype=torch.float64) if any(leg) else None,
+        )
 
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
         """Return the action of the navigator, with its declaration, and the decision behind that."""
@@ -266,19 +274,14 @@ class Onboard:
 
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
-        longest = self.options.max_move_km
-        if step.distance > limits.LONGER * longest:
-            raise ValueError(
-                f"distance {step.distance:g} km is longer than the longest leg of this vehicle, {longest:g} km: it "
-                "must be in kilometers, and since the last step; report a longer distance in parts, with None between"
-            )
+        limits.check_leg(step.distance, step.distance_std, self.options.max_move_km)
         if self._state is not None:
             since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
             limits.check_earth_jump(self._last, elements, since_km, noise)
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
-        if text := limits.out_of_range(self._range, elements):
+        if text := limits.out_of_range(self._within, elements):
             raise ValueError(f"the reading at the start: {text}")
         longest = LONGEST_WAY_KM if self._network else self.options.max_steps * self.options.max_move_km
         limits.check_earth_distance(elements, self.target, longest)
@@ -287,8 +290,9 @@ class Onboard:
         """Return the command: to stop, or the action of the navigator."""
         radius = track.posterior.radius(self.options.confidence).item()
         stop, reason = self._stop(track, decision, radius)
-        if not (stop or self._steps or self._known):
+        if not (stop or self._steps or self._template.known is not None):
             reason = _UNCHECKED[self.options.north]
+        reason = reason if stop else self._doubt.text or reason
         distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
         steer = math.degrees(course + turn) % 360.0
         north, east = track.way.displacement.tolist()
@@ -302,16 +306,13 @@ class Onboard:
         options, doubt = self.options, self._doubt
         if text := self._lost(track):
             return "lost", text
-        if text := limits.out_of_range(self._range, self._last):
+        if text := limits.out_of_range(self._within, self._last):
             return "out of range", text
         if self._rules.start_km is not None and abs(latitude := track.state.place[0].item()) > HIGHEST_LATITUDE:
             return "out of range", f"latitude {latitude:.1f}: the model is valid to {HIGHEST_LATITUDE:g} degrees"
         way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
         if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
-            return (
-                "out of range",
-                f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}",
-            )
+            return "out of range", f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}"
         if not decision.declare.item() or doubt.level > LOST_SURPRISE:
             return None, ""
         if decision.probability.item() >= options.confidence:
@@ -330,8 +331,7 @@ class Onboard:
         """Return why readings or legs cannot be from a vehicle, as text; empty if they can."""
         useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
-        unchanged = [km * use for km, use in zip(self._unchanged, useful, strict=True)]
-        if text := limits.stuck(unchanged, self.options.max_move_km):
+        if text := limits.stuck(self._unchanged, self.options.max_move_km, useful, self._doubt.hung):
             return text
         if self._doubt.lost:
             causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
@@ -349,7 +349,7 @@ class Onboard:
             RuntimeError: before :meth:`start`.
             OSError: if the file cannot be written.
         """
-        if self.target is None:
+        if self._template is None:
             raise RuntimeError(_NOT_STARTED)
         write_atomically(Path(path), self._journal.replace(steps=self._steps).model_dump_json().encode())
 
