@@ -96,15 +96,14 @@ class Config(rule_settings("zeta", "arrival", "radius_km", "max_move_km", "max_t
     """Constant added to the expected loss that divides advantages; it limits the weight of easy episodes."""
 
     @property
-    def limits(self) -> dict[str, float]:
-        """Options of the environment."""
-        drift_km = self.drift * self.max_move_km
-        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
+    def drift_km(self) -> float:
+        """How much farther than its command a current may carry a vehicle [km]."""
+        return self.drift * self.max_move_km
 
     @property
     def reach_km(self) -> float:
         """Farthest that a leg takes a vehicle [km]."""
-        return self.max_move_km + self.limits["drift_km"]
+        return self.max_move_km + self.drift_km
 
 
 FAR = Config()

@@ -104,6 +104,11 @@ class RunConfig(CheckedModel):
         check_device(self.device)
         return self
 
+    @property
+    def rules(self) -> dict[str, Any]:
+        """Rules of an episode among the settings, which replace the scenario's."""
+        return self.model_dump(include=set(RULES))
+
     def linear(self, name: str, remaining: float) -> float:
         """Interpolate a setting linearly from ``name`` to ``final_name``, by the remaining share of the training."""
         start, end = getattr(self, name), getattr(self, f"final_{name}")
@@ -148,11 +153,6 @@ class RegionConfig(rule_settings("zeta"), RunConfig):  # type: ignore[misc]
     def load_scenario(self) -> Scenario:
         """Return the scenario of the file, or the paper's."""
         return Scenario() if self.scenario is None else load_scenario(self.scenario)
-
-    @property
-    def rules(self) -> dict[str, Any]:
-        """Rules of an episode among the settings, which replace the scenario's."""
-        return self.model_dump(include=set(RULES))
 
 
 class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
