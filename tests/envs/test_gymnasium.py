@@ -247,7 +247,7 @@ def test_keys_of_own_transforms_can_be_observed() -> None:
 
 
 def test_measures_are_those_of_metrics() -> None:
-    torch.manual_seed(0)
+    torch.manual_seed(2)
     env, envs = GeomagneticNavEnv(num_envs=NUM, seed=3, **SHORT), make_vec(scale_actions=False, **SHORT)
     rollout = env.rollout(SHORT["max_steps"], break_when_any_done=False, break_when_all_done=True)
     expected = episode_measures(rollout)
