@@ -17,6 +17,8 @@ from pathlib import Path
 
 from magrl import tracking
 from magrl.envs import GeomagneticNavEnv
+from magrl.tracking.belief import moved, read
+from magrl.tracking.destination import destination, posterior
 from magrl.transforms.track import reading_of
 
 import torch
@@ -56,15 +58,13 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
     after = reading_of(env.step(state)["next"])
     track = tracking.begin(rules, first)
     belief, std = track.state.belief, after.std.noise
-    goal = tracking.destination(belief, after.target, rules.range_km)
+    goal = destination(belief, after.target, rules.range_km)
     declared = rules.replace(arrival="declared")
     return {
         "environment: step": lambda: env.step(state),
         "environment: start of an episode": lambda: env.reset(),
-        "belief: move and reading": lambda: tracking.read(
-            tracking.moved(belief, after.distance, after.heading), after.field, std
-        ),
-        "posterior of the destination": lambda: tracking.posterior(goal),
+        "belief: move and reading": lambda: read(moved(belief, after.distance, after.heading), after.field, std),
+        "posterior of the destination": lambda: posterior(goal),
         "track: belief, posterior and plan": lambda: tracking.advance(rules, track.state, after),
         "declaration of the arrival": lambda: tracking.declaring(declared, track, after, track.plan),
     }

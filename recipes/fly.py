@@ -29,7 +29,7 @@ from magrl.evaluation.navigators import named
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
-from magrl.tracking import Way
+from magrl.tracking.way import Way
 from magrl.training import UsageError, command, parse
 from magrl.transforms import conditions_named
 

@@ -23,7 +23,10 @@ from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.envs.scenario import rule_settings
-from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
+from magrl.tracking import Rules
+from magrl.tracking.destination import RANGE_KM
+from magrl.tracking.network import correction_network
+from magrl.tracking.observation import OBSERVATION_SIZE
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, Discount, Noise, NonNegative, PlanetConfig, Positive, Rising, Widths
 from magrl.training.run import make_collector

@@ -27,7 +27,7 @@ from magrl.field.elements import NAMES
 from magrl.files import check_writable, write_text, write_with
 from magrl.geodesy import check_positions, geodesic
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.tracking import Way
+from magrl.tracking.way import Way
 from magrl.training import UsageError, command, parse
 from magrl.vehicle.logs import difference_from_igrf, mistakes, read_readings
 from magrl.vehicle.onboard import Onboard

@@ -4,8 +4,7 @@ import math
 
 from magrl.field.elements import axes_of_elements, elements_of_axes
 from magrl.sensor_std import SensorStd
-from magrl.tracking import read, start
-from magrl.tracking.belief import IRON
+from magrl.tracking.belief import IRON, read, start
 
 import torch
 

@@ -20,8 +20,8 @@ from magrl.field.elements import measured_elements
 from magrl.files import write_text
 from magrl.geodesy import geodesic
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Belief, before, destination, known, moved, posterior, read
-from magrl.tracking.destination import log_density
+from magrl.tracking.belief import Belief, before, known, moved, read
+from magrl.tracking.destination import destination, log_density, posterior
 from magrl.training import command
 from magrl.vehicle.logs import read_readings
 from magrl.vehicle.mistakes import MODEL_STD

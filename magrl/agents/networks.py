@@ -10,7 +10,9 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhModule, ValueOperator
 
 from magrl.checks import check_number, check_type
-from magrl.tracking import Rules, corrected, moving
+from magrl.tracking import Rules
+from magrl.tracking.pilot import moving
+from magrl.tracking.planning import corrected
 
 Device = torch.device | str | None
 MOST_LAYERS = 64
@@ -80,7 +82,7 @@ def make_actor(
 
 
 class CorrectedMove(nn.Module):
-    """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.corrected`.
+    """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.planning.corrected`.
 
     Args:
         rules: limits of the leg.
@@ -106,11 +108,11 @@ def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequent
     ``action``, scaled to [-1, 1].
 
     Args:
-        network: from ``observation`` to a correction (:func:`magrl.tracking.correction_network`).
+        network: from ``observation`` to a correction (:func:`magrl.tracking.network.correction_network`).
         rules: limits of the leg.
 
     Example:
-        >>> from magrl.tracking import correction_network
+        >>> from magrl.tracking.network import correction_network
         >>> make_correcting_actor(correction_network((32, 32)), Rules()).out_keys
         ['correction', 'action']
     """

@@ -18,7 +18,8 @@ from magrl.envs.regions import PAPER_REGION
 from magrl.envs.scenario import Scenario
 from magrl.field import WeatherRecord
 from magrl.registry import NAMED_TASKS
-from magrl.tracking import STEP_PRICE, Rules
+from magrl.tracking import Rules
+from magrl.tracking.planning import STEP_PRICE
 from magrl.transforms import (
     AlignmentReward,
     FieldGradient,

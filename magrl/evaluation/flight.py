@@ -17,7 +17,8 @@ from magrl.evaluation.episodes import episode_measures, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import Navigator, policy_env
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import EarthModel, Rules, earth_model
+from magrl.tracking import Rules, earth_model
+from magrl.tracking.earth import EarthModel
 from magrl.transforms import Conditions, KnownPlace, TrackField, conditions_named, with_conditions
 from magrl.transforms.errors.north import MAGNETIC
 from magrl.transforms.track import known_keys

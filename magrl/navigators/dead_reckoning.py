@@ -13,7 +13,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.geodesy import geodesic, move_place, steer
 from magrl.navigators.base import Navigator
 from magrl.sensor_std import SensorStd
-from magrl.tracking import EarthModel
+from magrl.tracking.earth import EarthModel
 from magrl.transforms.errors.known import PLACE_KEYS
 
 ARRIVED_KM = 0.5

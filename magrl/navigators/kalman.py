@@ -77,7 +77,7 @@ class Anywhere(Kalman):
 
     Args:
         rules: as of :class:`Kalman`; the training's by default.
-        source: file of :func:`magrl.tracking.save_pilot`, or a network from the observation to a correction; the
+        source: file of ``save_pilot``, or a network from the observation to a correction; the
             pretrained agent by default.
         changes: values of :class:`~magrl.tracking.Rules` that replace those.
 

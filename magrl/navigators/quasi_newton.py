@@ -18,7 +18,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
@@ -26,8 +25,10 @@ from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.navigators.base import Navigator, element_indices
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import Way
 from magrl.tracking.local import inverse2
+from magrl.tracking.planning import SLOPES, sensor_length
+from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
+from magrl.tracking.way import Way
 
 CURVATURE = (1.5e-6, 1.8e-6, 1.2e-3)
 """Standard deviation of the change of a gradient along the path: D, I [deg], B_H [nT], per km^2, typical of the Earth's
@@ -185,7 +186,7 @@ class QuasiNewton(Navigator):
     The filter (:func:`next_track`) weighs each reading by its noise and the length of the leg, and each
     element by how well it determines the displacement. Without noise, the first update is Broyden's. With ``search``,
     the vehicle aims at the most probable destination, given that the episode has not ended at the places where it has
-    been (:func:`~magrl.tracking.unvisited`).
+    been (:func:`~magrl.tracking.search.unvisited`).
 
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
@@ -194,7 +195,7 @@ class QuasiNewton(Navigator):
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
-        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
+        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.search.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
             it, the displacement is the estimated one.
         radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
@@ -302,8 +303,8 @@ class QuasiNewton(Navigator):
         if not self.search:
             return way.displacement
         gradient, covariance = track.mean[..., 1:], track.covariance[..., 1:, 1:]
-        ellipse = tracking.arrival_ellipse(gradient, covariance, memory["weights"][:, self.elements], self.radius_km)
-        return tracking.unvisited(way, memory["visited"], ellipse)
+        ellipse = arrival_ellipse(gradient, covariance, memory["weights"][:, self.elements], self.radius_km)
+        return unvisited(way, memory["visited"], ellipse)
 
     def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad] of a leg in a direction ``(N, 2)`` northward and eastward."""
@@ -351,7 +352,7 @@ def first_places(seen: TensorDictBase, zeta: float) -> dict[str, Tensor]:
         {'visited': (1, 24, 2), 'weights': (1, 3)}
     """
     field, target = (seen[key].double() for key in ("field", "target_field"))
-    return {"visited": tracking.unvisited_yet(field), "weights": tracking.arrival_weights(field, target, zeta)}
+    return {"visited": unvisited_yet(field), "weights": arrival_weights(field, target, zeta)}
 
 
 def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
@@ -366,7 +367,7 @@ def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
         tensor([[  0.,   0.],
                 [ 70., 100.]], dtype=torch.float64)
     """
-    visited = tracking.visit(memory["visited"].double(), displacement(seen))
+    visited = visit(memory["visited"].double(), displacement(seen))
     memory["visited"] = torch.where((seen["elapsed_steps"] == 0).unsqueeze(-1), memory["visited"].double(), visited)
 
 
@@ -374,7 +375,7 @@ def probe_length(noise: Sequence[float]) -> float:
     """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
 
     The loss by both legs grows with their length p, the loss by the wrong direction with (noise / p)^2, the noise as in
-    :func:`magrl.tracking.sensor_length`; their sum is smallest for p proportional to noise^(2/3). The factor is from
+    ``sensor_length``; their sum is smallest for p proportional to noise^(2/3). The factor is from
     simulations.
 
     Args:
@@ -385,7 +386,7 @@ def probe_length(noise: Sequence[float]) -> float:
         [0.5, 6.1, 11.2, 17.7]
     """
     check_numbers(3, 0, noise=noise)
-    length = float(tracking.sensor_length(torch.tensor(noise, dtype=torch.float64)))
+    length = float(sensor_length(torch.tensor(noise, dtype=torch.float64)))
     return max(SHORTEST_PROBE_KM, 5.0 * length ** (2 / 3))
 
 
@@ -431,7 +432,7 @@ class Secant(QuasiNewton):
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
-        std = reading.new_tensor([tracking.SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
+        std = reading.new_tensor([SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
         return GradientPrior(torch.zeros_like(std), std)
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:

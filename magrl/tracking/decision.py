@@ -87,7 +87,8 @@ def arrival_decision(
         radius_km: distance from the destination within which a declaration is right [km].
 
     Example:
-        >>> from magrl.tracking import destination, posterior, start
+        >>> from magrl.tracking.belief import start
+        >>> from magrl.tracking.destination import destination, posterior
         >>> here, errors = torch.tensor([8.0, -16.0, 35000.0]), SensorStd(torch.tensor([0.02, 0.02, 2.0]))
         >>> goal = destination(start(here, errors), here, range_km=300.0)
         >>> trip = Trip(torch.tensor(400.0), torch.tensor([400.0, 0.0]), torch.tensor(9), 0.5, 50.0)

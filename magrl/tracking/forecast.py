@@ -35,7 +35,8 @@ def covariance_after(
         readings: number of readings at each place, whose noise is averaged: a number or ``(M,)``.
 
     Example:
-        >>> from magrl.tracking import destination, start
+        >>> from magrl.tracking.belief import start
+        >>> from magrl.tracking.destination import destination
         >>> here, errors = torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0]))
         >>> goal = destination(start(here, errors), torch.tensor([3.0, 66.0, 17500.0]), 300.0)
         >>> moves = torch.tensor([[50.0, 0.0], [0.0, 50.0]])

@@ -76,7 +76,7 @@ def begin(rules: Rules, reading: Reading) -> Track:
 def advance(rules: Rules, state: State, reading: Reading) -> Track:
     """Return the track after a leg and the reading at its end.
 
-    The stated noise is always scaled by what the readings show (:func:`~magrl.tracking.noise_estimate`), and a spike
+    The stated noise is always scaled by what the readings show (``noise_estimate``), and a spike
     counts less (:func:`~magrl.tracking.spike_factor`).
     """
     return _estimated(rules, reading, *_advanced(rules, state, reading))
@@ -241,7 +241,7 @@ def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, t
 
 def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:
     """Return what a network observes of a track ``(..., 19)``, relative to the heading
-    (:func:`~magrl.tracking.track_observation`)."""
+    (:func:`~magrl.tracking.observation.track_observation`)."""
     heading, like = _true(reading, track.state.north).heading.unsqueeze(-1), reading.target
 
     def ahead(vector: Tensor) -> Tensor:
@@ -270,7 +270,7 @@ def act(rules: Rules, track: Track, reading: Reading, network: Callable[[Tensor]
         track: after the reading.
         reading: that reading.
         network: from an :func:`observation` to a correction ``(..., 2)`` of the plan
-            (:func:`~magrl.tracking.corrected`); None to fly as planned.
+            (:func:`~magrl.tracking.planning.corrected`); None to fly as planned.
     """
     plan = track.plan if network is None else corrected(track.plan, network(observation(rules, track, reading)))
     return moving(rules, plan, _true(reading, track.state.north).heading)
@@ -287,9 +287,9 @@ def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> t
     """Return an action ``(..., 2)`` with the declaration ``(..., 3)``: 1 where the vehicle has arrived, else -1.
 
     Where it is probably within the radius, and further readings are not worth their cost
-    (:func:`~magrl.tracking.arrival_decision`), it stays and declares.
+    (:func:`~magrl.tracking.decision.arrival_decision`), it stays and declares.
     Before, where its estimated distance is less than the radius, it approaches the estimated place and stops where
-    readings are worth most (:func:`~magrl.tracking.approach`). Elsewhere it moves as ``action`` says.
+    readings are worth most (:func:`~magrl.tracking.decision.approach`). Elsewhere it moves as ``action`` says.
     """
     state, left = track.state, rules.max_steps - 1 - reading.step
     price = rules.step_price if reading.price is None else reading.price

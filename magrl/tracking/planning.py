@@ -117,7 +117,7 @@ def planned_move(
 
     - the path: the length of the leg plus the mean distance that then remains, over the posterior of the displacement;
     - the detour that the uncertainty of the displacement may then cost, times ``caution``: what a reading at the end of
-      the leg will teach does not depend on what will be read (:func:`~magrl.tracking.covariance_after`);
+      the leg will teach does not depend on what will be read (:func:`~magrl.tracking.forecast.covariance_after`);
     - the price of the steps that remain.
 
     Args:
@@ -134,7 +134,8 @@ def planned_move(
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
 
     Example:
-        >>> from magrl.tracking import destination, posterior, start
+        >>> from magrl.tracking.belief import start
+        >>> from magrl.tracking.destination import destination, posterior
         >>> here, errors = torch.tensor([8.0, -16.0, 35000.0]), SensorStd(torch.tensor([0.02, 0.02, 2.0]))
         >>> goal = destination(start(here, errors), torch.tensor([9.0, -20.0, 34500.0]), range_km=300.0)
         >>> way = posterior(goal)

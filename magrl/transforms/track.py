@@ -14,20 +14,12 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from magrl.checks import check_choice, check_type
 from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.tracking import (
-    OBSERVATION_SIZE,
-    DestinationPosterior,
-    LocalElements,
-    Reading,
-    Rules,
-    State,
-    Track,
-    Way,
-    advance,
-    begin,
-    declaring,
-    observation,
-)
+from magrl.tracking import Reading, Rules, Track, advance, begin, declaring
+from magrl.tracking.belief import LocalElements
+from magrl.tracking.observation import OBSERVATION_SIZE
+from magrl.tracking.pilot import observation
+from magrl.tracking.records import State
+from magrl.tracking.way import DestinationPosterior, Way
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
 from magrl.transforms.errors.known import PLACE_KEYS
 

@@ -16,8 +16,8 @@ from magrl.evaluation import evaluate, evaluation_rollout, summarize
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.files import load_tensors, save_tensors
 from magrl.navigators import Anywhere, Kalman, policy_env
-from magrl.tracking import Rules, correction_network
-from magrl.tracking.network import pretrained
+from magrl.tracking import Rules
+from magrl.tracking.network import correction_network, pretrained
 from magrl.transforms import SensorErrors
 
 

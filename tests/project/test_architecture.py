@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from magrl.envs.scenario import RULES
-from magrl.tracking import EpisodeRules
+from magrl.tracking.records import EpisodeRules
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "magrl"

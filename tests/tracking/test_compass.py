@@ -8,8 +8,9 @@ import torch
 from support.tracks import F64, STD, f64, randn, unknown
 
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Belief, covariance_after, destination, elements, innovation, moved, posterior, start
-from magrl.tracking.belief import STATES
+from magrl.tracking.belief import STATES, Belief, elements, innovation, moved, start
+from magrl.tracking.destination import destination, posterior
+from magrl.tracking.forecast import covariance_after
 from magrl.tracking.harmonics import turning
 from magrl.tracking.local import COEFFICIENTS
 from magrl.tracking.prior import CELLS, expected, latitude_cells

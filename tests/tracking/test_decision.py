@@ -9,10 +9,11 @@ import torch
 from support.tracks import F64, f64, randn
 from torch import Tensor
 
-from magrl import tracking
 from magrl.sensor_std import SensorStd
-from magrl.tracking import ArrivalDecision, DestinationPosterior, Trip, approach, arrival_decision
-from magrl.tracking.belief import STATES
+from magrl.tracking.belief import STATES, Belief, elements, moved, start
+from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
+from magrl.tracking.destination import destination, posterior
+from magrl.tracking.way import DestinationPosterior
 
 RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
 HERE = f64(0.0, 60.0, 20000.0)
@@ -23,20 +24,20 @@ def decide(
 ) -> tuple[ArrivalDecision, Tensor]:
     """The decision at a distance from the destination, with errors in units of degrees and 100 nT; and the gradient."""
     errors = SensorStd(noise * UNITS, bias * UNITS)
-    belief = tracking.start(HERE, errors)
+    belief = start(HERE, errors)
     rows = torch.eye(STATES, dtype=F64)[3:16]  # all but the field and the errors of readings
     cross = belief.covariance @ rows.mT
     exact = rows @ cross + 1e-9 * torch.diag((rows @ cross).diagonal())
     mean = belief.mean.index_add(0, torch.tensor([3]), f64(6000.0))  # D changes by 1 degree over 100 km eastward
-    belief = tracking.Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.place)
-    target = tracking.elements(tracking.moved(belief, f64(north_km)[0], f64(0.0)[0])).value
-    goal = tracking.destination(belief, target, 300.0)
+    belief = Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.place)
+    target = elements(moved(belief, f64(north_km)[0], f64(0.0)[0])).value
+    goal = destination(belief, target, 300.0)
     trip = Trip(f64(path)[0], f64(400.0, 0.0), torch.tensor(left), 0.5, 50.0)
-    posterior = tracking.posterior(goal, 512)
+    points = posterior(goal, 512)
     if places is not None:
-        posterior = DestinationPosterior(places, torch.full_like(places[:, 0], 1 / len(places)))
-    decided = arrival_decision(goal, posterior, errors, trip, RADIUS_KM)
-    return decided, tracking.elements(belief).gradient
+        points = DestinationPosterior(places, torch.full_like(places[:, 0], 1 / len(places)))
+    decided = arrival_decision(goal, points, errors, trip, RADIUS_KM)
+    return decided, elements(belief).gradient
 
 
 @pytest.mark.parametrize("bias", [0.1, 0.2])

@@ -13,9 +13,23 @@ from magrl.field import IGRF, FieldBank, SphericalHarmonicField, elements_at, ra
 from magrl.field.elements import elements_gradient, elements_jacobian, field_vector, measured_elements
 from magrl.geodesy import geodesic, move
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import Belief, before, destination, elements, innovation, known, mode, moved, posterior, read, start
-from magrl.tracking.belief import ANOMALY, ANOMALY_KM, CONSTANT, IRON, MODEL_NT, STATES
-from magrl.tracking.destination import log_density
+from magrl.tracking.belief import (
+    ANOMALY,
+    ANOMALY_KM,
+    CONSTANT,
+    IRON,
+    MODEL_NT,
+    STATES,
+    Belief,
+    before,
+    elements,
+    innovation,
+    known,
+    moved,
+    read,
+    start,
+)
+from magrl.tracking.destination import destination, log_density, mode, posterior
 from magrl.tracking.harmonics import generators, orders, size, turning
 from magrl.tracking.local import COEFFICIENTS
 from magrl.tracking.prior import lasting_covariances

@@ -10,8 +10,10 @@ from support.tracks import STD, f64
 from torch import Tensor
 
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import OBSERVATION_SIZE, Reading, Rules, Track, begin, observation, track_observation
+from magrl.tracking import Reading, Rules, Track, begin
 from magrl.tracking.noise import DEAD_BAND
+from magrl.tracking.observation import OBSERVATION_SIZE, track_observation
+from magrl.tracking.pilot import observation
 from magrl.transforms.track import reading_of
 
 

@@ -12,26 +12,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from magrl.sensor_std import SensorStd
-from magrl.tracking import (
-    VISITED,
-    ArrivalDecision,
-    Belief,
-    Reading,
-    Rules,
-    State,
-    Way,
-    act,
-    advance,
-    arrival_ellipse,
-    begin,
-    declaring,
-    earth_model,
-    pilot,
-    start,
-    unvisited,
-    unvisited_yet,
-    visit,
-)
+from magrl.tracking import Reading, Rules, act, advance, begin, declaring, earth_model, pilot
+from magrl.tracking.belief import Belief, start
+from magrl.tracking.decision import ArrivalDecision
+from magrl.tracking.records import State
+from magrl.tracking.search import VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
+from magrl.tracking.way import Way
 from magrl.transforms.track import reading_of
 
 ERRORS = SensorStd(STD, (0.5, 0.3, 60.0), (0.3, 0.2, 30.0), (20.0, 20.0, 20.0))

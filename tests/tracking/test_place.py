@@ -15,9 +15,10 @@ from magrl.field import IGRF
 from magrl.field.elements import elements_jacobian, measured_elements
 from magrl.geodesy import geodesic, move, move_place
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import EarthModel, Motion, Rules, destination, earth, earth_model, posterior, start
-from magrl.tracking.belief import DRIFT, PLACE, Belief, at_place, before, moved, read
-from magrl.tracking.earth import secular_variance
+from magrl.tracking import Rules, earth, earth_model
+from magrl.tracking.belief import DRIFT, PLACE, Belief, Motion, at_place, before, moved, read, start
+from magrl.tracking.destination import destination, posterior
+from magrl.tracking.earth import EarthModel, secular_variance
 from magrl.tracking.local import slopes
 from magrl.tracking.prior import lasting_covariances
 from magrl.tracking.survey import surveyed

@@ -10,13 +10,16 @@ from support.tracks import F64, STD, f64, randn
 from torch import Tensor
 from torch.autograd.functional import jacobian
 
-from magrl import tracking
 from magrl.field.elements import elements_jacobian
 from magrl.geodesy import geodesic, move
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Belief, Destination, DestinationPosterior, covariance_after, planning
-from magrl.tracking.belief import ANOMALY, CONSTANT
+from magrl.tracking import planning
+from magrl.tracking.belief import ANOMALY, CONSTANT, Belief, elements, moved, read, start
+from magrl.tracking.destination import Destination, destination, mode, posterior
+from magrl.tracking.forecast import covariance_after
+from magrl.tracking.planning import planned_move, step_price
 from magrl.tracking.prior import DEGREE, closure
+from magrl.tracking.way import DestinationPosterior
 
 RANGE_KM, KM = 300.0, f64(40.0)[0]
 HERE = f64(8.0, -16.0, 35000.0)
@@ -27,18 +30,18 @@ SHIP = SensorStd(NOISE, f64(3.0, 0.5, 150.0), f64(2.9, 0.4, 140.0), f64(100.0, 1
 
 def track(reading: Tensor, errors: SensorStd, legs: int, crust_nt: float = 0.0) -> Belief:
     """A belief after some legs of 40 km."""
-    belief = tracking.start(reading, errors, f64(0.3)[0])
+    belief = start(reading, errors, f64(0.3)[0])
     for leg in range(legs):
         course = f64(0.3 + 1.2 * leg)[0]
-        belief = tracking.moved(belief, KM, course, errors, crust_nt=crust_nt)
-        belief = tracking.read(belief, tracking.elements(belief).value + 0.5 * NOISE, errors.noise, course)
+        belief = moved(belief, KM, course, errors, crust_nt=crust_nt)
+        belief = read(belief, elements(belief).value + 0.5 * NOISE, errors.noise, course)
     return belief
 
 
 def goal_of(belief: Belief, errors: SensorStd, crust_nt: float = 0.0) -> Destination:
     """A destination 150 km away from the expected one."""
-    target = tracking.elements(tracking.moved(belief, f64(150.0)[0], f64(-0.7)[0])).value
-    return tracking.destination(belief, target + f64(0.1, 0.1, 20.0), RANGE_KM, crust_nt, errors)
+    target = elements(moved(belief, f64(150.0)[0], f64(-0.7)[0])).value
+    return destination(belief, target + f64(0.1, 0.1, 20.0), RANGE_KM, crust_nt, errors)
 
 
 def flown(reading: Tensor, errors: SensorStd, legs: int) -> Destination:
@@ -53,7 +56,7 @@ def prediction(belief: Belief, way: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     """The field at the end of a way: covariance, slopes ``(6,)`` by differences over 2 km, and theirs ``(6, 6)``."""
 
     def field(mean: Tensor, north: float, east: float) -> Tensor:
-        return tracking.moved(belief._replace(mean=mean), *polar(way + f64(north, east))).field
+        return moved(belief._replace(mean=mean), *polar(way + f64(north, east))).field
 
     def slopes(mean: Tensor) -> Tensor:
         ends = [field(mean, *end) - field(mean, *(-x for x in end)) for end in ((1.0, 0.0), (0.0, 1.0))]
@@ -69,13 +72,11 @@ def flown_covariance(
     """The covariance of a way by the belief after a leg and the expected readings at its end."""
     origin = belief.latitude, torch.zeros((), dtype=F64)
     km, course = polar(leg)
-    after = tracking.moved(belief, km, course, errors, crust_nt=goal.crust)
+    after = moved(belief, km, course, errors, crust_nt=goal.crust)
     for _ in range(readings):
         anomaly = elements_jacobian(after.field) @ after.mean[ANOMALY]
-        after = tracking.read(
-            after, tracking.elements(after).value + after.mean[CONSTANT] + anomaly, errors.noise, course
-        )
-    after = tracking.destination(after, f64(0.0, 60.0, 20000.0), RANGE_KM, goal.crust, errors).belief
+        after = read(after, elements(after).value + after.mean[CONSTANT] + anomaly, errors.noise, course)
+    after = destination(after, f64(0.0, 60.0, 20000.0), RANGE_KM, goal.crust, errors).belief
     distance, bearing = geodesic(*move(*origin, course, km), *move(*origin, *polar(way)[::-1]))
     covariance, _, later = prediction(after, distance * torch.stack((bearing.cos(), bearing.sin())))
     _, slopes, now = prediction(goal.belief, way)
@@ -96,10 +97,10 @@ def differs(found: Tensor, expected: Tensor) -> float:
 def test_the_forecast_is_the_covariance_after_the_leg_is_flown(
     errors: SensorStd, crust_nt: float, reading: Tensor, legs: int, missing: int | None
 ) -> None:
-    """By :func:`~magrl.tracking.moved`, :func:`~magrl.tracking.read` and differences of what is predicted."""
+    """By ``moved``, ``read`` and differences of what is predicted."""
     belief, moves = track(reading, errors, legs, crust_nt), f64((30.0, 0.0), (-10.0, 40.0))
     goal = goal_of(belief, errors, crust_nt)
-    way = tracking.mode(goal).displacement
+    way = mode(goal).displacement
     if missing is not None:
         errors = errors._replace(noise=NOISE.index_fill(0, torch.tensor([missing]), math.inf))
     for found, leg in zip(covariance_after(goal, way, moves, errors), moves, strict=True):
@@ -110,7 +111,7 @@ def test_the_forecast_averages_the_noise_of_many_readings() -> None:
     errors, leg = SensorStd(4 * NOISE), f64(20.0, -30.0)
     belief = track(HERE, errors, 2)
     goal = goal_of(belief, errors)
-    way = tracking.mode(goal).displacement
+    way = mode(goal).displacement
     one, six = covariance_after(goal, way, leg.expand(2, 2), errors, torch.tensor([1, 6]))
     assert differs(six, flown_covariance(belief, goal, way, leg, errors, readings=6)) < 0.02
     assert six.trace() < 0.8 * one.trace()
@@ -120,7 +121,7 @@ def test_the_forecast_averages_the_noise_of_many_readings() -> None:
 def test_a_more_accurate_reading_never_increases_the_forecast(errors: SensorStd) -> None:
     """In any direction; a missing reading is the least accurate."""
     goal, moves = flown(HERE, errors, 1), 60 * randn(20, 2)
-    way, stds = tracking.mode(goal).displacement, (math.inf, 30.0, 3.0, 1.0, 0.3, 0.0)
+    way, stds = mode(goal).displacement, (math.inf, 30.0, 3.0, 1.0, 0.3, 0.0)
     noises = [NOISE * std if std else 0 * NOISE for std in stds]
     after = torch.stack([covariance_after(goal, way, moves, errors._replace(noise=noise)) for noise in noises])
     assert torch.linalg.eigvalsh(after[:-1] - after[1:]).amin() > -1e-4 * after.norm()
@@ -129,9 +130,9 @@ def test_a_more_accurate_reading_never_increases_the_forecast(errors: SensorStd)
 
 def plan(goal: Destination, price_km: float, errors: SensorStd, **options: float) -> tuple[float, float]:
     """Length [km] of the move, and its angle to the way [deg]."""
-    posterior = tracking.posterior(goal)
-    aim = posterior.way().displacement.double()
-    planned = tracking.planned_move(goal, posterior, aim, errors, f64(price_km)[0], 50.0, **options)
+    points = posterior(goal)
+    aim = points.way().displacement.double()
+    planned = planned_move(goal, points, aim, errors, f64(price_km)[0], 50.0, **options)
     (length, course), (_, ahead) = polar(planned), polar(aim)
     return length.item(), abs(math.degrees(course - ahead))
 
@@ -158,7 +159,7 @@ def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
         here = Destination(belief, field, goal.range, noise, crust, share)
         points = aims[index].unsqueeze(-2) + apart + 100.0  # of which only the shape counts
         posterior = DestinationPosterior(points, torch.full(points.shape[:-1], 0.5, dtype=F64))
-        return tracking.planned_move(here, posterior, aims[index], WHITE, prices[index], 50.0)
+        return planned_move(here, posterior, aims[index], WHITE, prices[index], 50.0)
 
     torch.testing.assert_close(planned(0), f64(-30.0, 40.0))
     torch.testing.assert_close(planned(slice(None)), torch.stack((planned(0), planned(1))))
@@ -175,7 +176,7 @@ def test_the_price_of_a_step_rises_as_steps_run_out() -> None:
     """Of 50 steps, 15 are for a way of 500 km; a poor reading keeps some in reserve, and a missing one none."""
 
     def price(percent: object, range_km: float, way_km: float, steps: Tensor, std: object) -> list[float]:
-        return tracking.step_price(percent, range_km, f64(0.0, way_km), steps, std, 50, 50.0).tolist()
+        return step_price(percent, range_km, f64(0.0, way_km), steps, std, 50, 50.0).tolist()
 
     exact, steps = (0.0, 0.0, 0.0), torch.tensor([0, 10, 34, 49])
     assert price(0.5, 400.0, 500.0, steps, exact) == pytest.approx([2 * (50 / x) ** 4 for x in (35, 25, 1, 1)])

@@ -14,8 +14,8 @@ from magrl import tracking
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.tracking import Motion, earth_model
-from magrl.tracking.belief import PLACE, at_place, settled, updated
+from magrl.tracking import earth_model
+from magrl.tracking.belief import PLACE, Motion, at_place, settled, updated
 from magrl.tracking.pilot import position_fix
 from magrl.vehicle.onboard import Command, Onboard
 

@@ -31,8 +31,8 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import move, move_place
 from magrl.navigators import Anywhere, Navigator, policy_env
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Rules, load_pilot, save_pilot
-from magrl.tracking.network import pretrained
+from magrl.tracking import Rules
+from magrl.tracking.network import load_pilot, pretrained, save_pilot
 from magrl.transforms import MagneticNorth, SensorErrors
 from magrl.vehicle.mistakes import likely_mistake
 from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import torch
 
 from magrl.field.elements import NAMES
-from magrl.tracking import State, Track, elements
+from magrl.tracking import Track
 from magrl.tracking.anomalies import joint_tail
+from magrl.tracking.belief import elements
+from magrl.tracking.records import State
 from magrl.vehicle.onboard.journal import Step
 
 LEAST_FIT = 0.01

@@ -17,9 +17,10 @@ from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
 from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
-from magrl.tracking import Rules, State, Way
+from magrl.tracking import Rules
 from magrl.tracking.belief import CONSTANT, DRIFT, PLACE
-from magrl.tracking.records import FARTHEST_START_KM
+from magrl.tracking.records import FARTHEST_START_KM, State
+from magrl.tracking.way import Way
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""

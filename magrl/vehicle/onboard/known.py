@@ -13,10 +13,13 @@ from magrl.checks import check_number, check_numbers
 from magrl.field.elements import field_vector
 from magrl.field.igrf import parse_date
 from magrl.sensor_std import SensorStd
-from magrl.tracking import NEWEST, SLOPES, EarthModel, Reading, Rules, State, earth_model
+from magrl.tracking import Reading, Rules, earth_model
 from magrl.tracking.anomalies import recentered, reweighed
 from magrl.tracking.belief import updated
+from magrl.tracking.earth import NEWEST, EarthModel
 from magrl.tracking.pilot import position_fix
+from magrl.tracking.planning import SLOPES
+from magrl.tracking.records import State
 from magrl.vehicle.mistakes import deviation, likely_mistake, model_std
 from magrl.vehicle.onboard.journal import Fix, Journal, Triple
 from magrl.vehicle.onboard.limits import check_earth_reading

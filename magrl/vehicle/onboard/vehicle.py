@@ -16,13 +16,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from magrl import tracking
 from magrl.checks import check_type
 from magrl.files import write_atomically
 from magrl.sensor_std import OUTAGE_STD
-from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
+from magrl.tracking import Reading, Rules, Track, act, advance, begin, declaring
 from magrl.tracking.belief import PLACE
+from magrl.tracking.decision import ArrivalDecision
+from magrl.tracking.earth import NEWEST
 from magrl.tracking.network import load_pilot, policy_content, pretrained
+from magrl.tracking.records import State
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
@@ -56,7 +58,7 @@ class Onboard:
 
     Args:
         navigator: ``"anywhere"`` for the pretrained agent, ``"kalman"``, or a file of
-            :func:`~magrl.tracking.save_pilot`, which run without TorchRL; ``"secant"``, a file of
+            :func:`~magrl.tracking.network.save_pilot`, which run without TorchRL; ``"secant"``, a file of
             :func:`magrl.save_policy`, a policy or a navigator, of which the vehicle gets a copy.
         options: of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are from the
             training, but :data:`USUAL`. The limits of a leg are at most the training's limits.
@@ -113,7 +115,7 @@ class Onboard:
         With a date, the vehicle carries a model of the Earth, by default the newest that ships with the library. Where
         it also knows its place, it follows it along the path, and steers between places. Without a date, it knows
         nothing of the Earth but the spectrum of its field, as in the paper. Where the elements at the start are known,
-        the first reading shows the constant errors of the sensors (:func:`magrl.tracking.known`). A first reading that
+        the first reading shows the constant errors of the sensors (``known``). A first reading that
         does not fit the start raises an error.
 
         Args:
@@ -230,11 +232,11 @@ class Onboard:
         reading = self._reading(step, read, elements, course)
         with torch.inference_mode():
             if self._state is None:
-                track = tracking.begin(self._rules, reading)
+                track = begin(self._rules, reading)
                 check_first_reading(reading, track.tail.item())
                 self._other = self._other and self._other.begun(self.options, reading)
             else:
-                track = tracking.advance(self._rules, self._state, reading)
+                track = advance(self._rules, self._state, reading)
             if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
                 raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             action, decision = self._act(track, reading)
@@ -263,10 +265,10 @@ class Onboard:
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
         """Return the action of the navigator, with its declaration, and the decision behind that."""
         if self._other is None:
-            action = tracking.act(self._rules, track, reading, self._network)
+            action = act(self._rules, track, reading, self._network)
         else:
             action = self._other.move(reading)
-        return tracking.declaring(self._rules, track, reading, action)
+        return declaring(self._rules, track, reading, action)
 
     def _comparable(self, elements: Any) -> Any:
         """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""
