@@ -10,11 +10,10 @@ import pytest
 import torch
 from support.tracks import f64
 
-from magrl import tracking
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.tracking import earth_model
+from magrl.tracking import advance, earth_model
 from magrl.tracking.belief import PLACE, Motion, at_place, settled, updated
 from magrl.tracking.pilot import position_fix
 from magrl.vehicle.onboard import Command, Onboard
@@ -166,14 +165,14 @@ def test_errors_of_places_and_legs_have_limits(call: Any, message: str) -> None:
 
 def test_an_estimate_that_is_not_finite_is_refused_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     (vehicle, _), (other, _) = sailed(), sailed()
-    step, right = {"heading": 270.0, "distance": 40.0}, tracking.advance
+    step, right = {"heading": 270.0, "distance": 40.0}, advance
 
     def wrong(*given: Any) -> Any:
         track = right(*given)
         return track._replace(state=track.state._replace(mean=track.state.mean * float("nan")))
 
     with monkeypatch.context() as patch:
-        patch.setattr(tracking, "advance", wrong)
+        patch.setattr("magrl.vehicle.onboard.vehicle.advance", wrong)
         with pytest.raises(ValueError, match=r"the estimate is not finite after this leg: check its distance"):
             vehicle.step(*at(0.0, -120.0), **step)
     assert vehicle.step(*at(0.0, -120.0), **step) == other.step(*at(0.0, -120.0), **step)
@@ -227,7 +226,7 @@ def test_elements_that_are_not_read_count_neither_in_the_tail_nor_in_the_surpris
         vehicle.step(*at(0.0), heading=0.0)
         reading = vehicle._template._replace(field=f64(d + 0.3, missing, h).float(), distance=torch.tensor(10.0))
         reading = reading._replace(std=reading.std._replace(noise=f64(0.02, noise, 2.0)), step=torch.tensor(1))
-        tracks.append(tracking.advance(vehicle._rules, vehicle._state, reading))
+        tracks.append(advance(vehicle._rules, vehicle._state, reading))
     outage, absent = tracks
     assert outage.surprise.item() == pytest.approx(absent.surprise.item(), rel=1e-3)
     assert outage.tail.item() == pytest.approx(absent.tail.item(), rel=1e-3)

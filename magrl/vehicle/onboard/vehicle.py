@@ -264,10 +264,8 @@ class Onboard:
 
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
         """Return the action of the navigator, with its declaration, and the decision behind that."""
-        if self._other is None:
-            action = act(self._rules, track, reading, self._network)
-        else:
-            action = self._other.move(reading)
+        network, other = self._network, self._other
+        action = act(self._rules, track, reading, network) if other is None else other.move(reading)
         return declaring(self._rules, track, reading, action)
 
     def _comparable(self, elements: Any) -> Any:
