@@ -19,7 +19,7 @@ from magrl.tracking.way import DestinationPosterior
 STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
 """Distances from the estimated place to which a vehicle may come to read, as shares of the radius."""
 SHORT = 0.25
-"""The least distance at which it stops, as a share of the radius: estimates vary by more."""
+"""The least distance at which it stops is half of the estimate's error, at most this share of the radius."""
 TURN_DEG = 90.0
 """Turn before each further reading there, so that errors which turn with the vehicle, such as iron, average out."""
 READINGS = (1, 2, 4, 8, 16, 32)
@@ -111,7 +111,8 @@ def arrival_decision(
     later = later.where(possible, 0.0)
     worth, best = (later * _efficiency(trip, way, distance - stops, readings)).flatten(-2).max(-1)
     attainable = torch.maximum(probability, later.flatten(-2).amax(-1))
-    stop_km = stops[best % len(STOPS)].clamp_min(SHORT * radius_km)
+    error = covariance[..., 0, :, :].diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().to(way)
+    stop_km = torch.maximum(stops[best % len(STOPS)], (error / 2).clamp_max(SHORT * radius_km))
     return ArrivalDecision(probability, worth, attainable, way, stop_km)
 
 
