@@ -26,6 +26,8 @@ from magrl.vehicle.onboard import Command, Onboard
 
 FLIGHTS, CONFIDENCE, RADIUS_KM, START_KM, STORM_KM = 12, 0.9, 25.0, 5.0, 667.0
 DATE = "2025-01-01"  # the only one of IGRF-13 and WMMHR
+SEED = 78
+SURVEY_STD = (0.1, 0.05, 30.0)
 WEATHER_KM = 125.0  # length over which the weather of a flight changes
 CRUST = cache(WMMHR)
 Place = tuple[float, float]
@@ -42,21 +44,30 @@ class Row:
     model: str | None = "IGRF-14"
     date: str | None = DATE
     off_km: float = 0.0  # of the start, which it states to START_KM
-    crust: bool = False
+    crust: float = 0.0  # size of anomalies, over those of WMMHR, which have 26 to 42 nT
+    survey: bool = False  # whether the elements of the destination were measured, with the errors SURVEY_STD
+    there_nt: float = 0.0  # of an anomaly at the destination alone, in each axis
+    gyro_deg: float = 0.0  # drift of the heading in each leg
     storm_nt: float = 0.0  # that grows along the path, and ends after STORM_KM
     spike: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the first reading
 
 
 RIGHT = Row("right, IGRF-13", model="IGRF-13")
+SURVEYED = Row("right, with a survey of the destination", survey=True)
 SPIKE = Row("a spike in the first reading", spike=(0.3, 0.3, 300.0))
 BROKEN = (
     Row("start 100 km off, IGRF-14", off_km=100.0),
     Row("destination by coordinates, start unknown, IGRF-13", start=False, model="IGRF-13"),
-    Row("the same with a crust, IGRF-14", start=False, crust=True),
-    Row("crust", crust=True),
-    Row("crust, nothing known", start=False, elements=True, model=None, date=None, crust=True),
+    Row("the same with a crust, IGRF-14", start=False, crust=1.0),
+    Row("crust", crust=1.0),
+    Row("crust, twice as large", crust=2.0),
+    Row("crust, three times as large", crust=3.0),
+    Row("crust, nothing known", start=False, elements=True, model=None, date=None, crust=1.0),
     Row("storm, IGRF-14", storm_nt=400.0),
     Row("the date is 2015", date="2015-01-01"),
+    Row("an anomaly of 133 nT at the destination", survey=True, there_nt=77.0),
+    Row("an anomaly of 266 nT at the destination", survey=True, there_nt=154.0),
+    Row("a heading that drifts by 0.25 degrees a leg", gyro_deg=0.25),
 )
 
 
@@ -90,10 +101,11 @@ def at(place: Place, north_east_km: Numbers) -> Place:
 
 def field_at(place: Place, row: Row) -> Numbers:
     """North, east, down [nT]."""
-    if row.crust:
-        return CRUST(DATE)(*torch.tensor(place, dtype=torch.float64)).numpy()
     east, north, up = igrf(*place[::-1], 0.0, datetime.datetime.fromisoformat(DATE), coeff_fn=shc_fn_igrf14)
-    return np.array((north.item(), east.item(), -up.item()))
+    core = np.array((north.item(), east.item(), -up.item()))
+    if not row.crust:
+        return core
+    return core + row.crust * (CRUST(DATE)(*torch.tensor(place, dtype=torch.float64)).numpy() - core)
 
 
 def elements(field: Numbers) -> Numbers:
@@ -123,24 +135,33 @@ class Sensors:
         return elements(field + turn @ self.iron) + self.constant + slow + self.noise * self.random.normal(size=3)
 
 
-def started(row: Row, conditions: Conditions, target: Place, start: Place) -> Onboard:
+def started(row: Row, conditions: Conditions, target: Place, start: Place, random: np.random.Generator) -> Onboard:
     """A vehicle with the accuracy of its conditions, that knows what the row tells it."""
     share, wander_km = conditions.motion_std
     options = {"confidence": CONFIDENCE, "radius_km": RADIUS_KM, "drift": share, "wander_km": wander_km}
     vehicle = Onboard("kalman", sensor_std=conditions.std, **options)
     goal = elements(field_at(target, row)) if row.elements else target
-    vehicle.start(tuple(goal), start if row.start else None, date=row.date, model=row.model, start_km=START_KM)
+    survey = {}
+    if row.survey:
+        there = elements(field_at(target, row) + row.there_nt * random.choice((-1, 1), 3))
+        survey = {"target_elements": tuple(there + SURVEY_STD * random.normal(size=3)), "target_std": SURVEY_STD}
+    known = {"date": row.date, "model": row.model, "start_km": START_KM}
+    vehicle.start(tuple(goal), start if row.start else None, **known, **survey)
     return vehicle
 
 
-def flown(row: Row, number: int) -> Flight:
-    random, conditions = np.random.default_rng((78, number)), CONDITIONS[("ship", "underwater")[number % 2]]
+def flown(row: Row, number: int, seed: int = SEED) -> Flight:
+    random, conditions = np.random.default_rng((seed, number)), CONDITIONS[("ship", "underwater")[number % 2]]
     place = (math.degrees(math.asin(random.uniform(-0.8, 0.8))), random.uniform(-180, 180))  # up to 53 degrees
     course, wrong = random.uniform(0, 360, 2)
     target = at(place, random.uniform(300, 500) * unit(course))
     start = at(at(place, START_KM / np.sqrt(2) * random.normal(size=2)), row.off_km * unit(wrong))
     (share, wander_km), sensors = conditions.motion_std, Sensors(conditions.std, random)
-    vehicle, drift, commands = started(row, conditions, target, start), share * random.normal(size=2), []
+    vehicle, drift, commands = (
+        started(row, conditions, target, start, np.random.default_rng((seed, number, 1))),
+        share * random.normal(size=2),
+        [],
+    )
     refused, heading, distance, path = False, random.uniform(0, 360), 0.0, 0.0
     while not commands or (not commands[-1].stop and len(commands) < vehicle.options.max_steps):
         field = field_at(place, row)
@@ -155,7 +176,8 @@ def flown(row: Row, number: int) -> Flight:
             refused = True
             continue
         heading, distance = commands[-1].heading_deg, commands[-1].distance_km
-        place = at(place, distance * (unit(heading) + drift) + wander_km * np.sqrt(distance) * random.normal(size=2))
+        true = unit(heading + row.gyro_deg * len(commands))
+        place = at(place, distance * (true + drift) + wander_km * np.sqrt(distance) * random.normal(size=2))
         path += distance
     return Flight(commands, Geodesic.WGS84.Inverse(*place, *target)["s12"] / 1000)
 
