@@ -52,7 +52,7 @@ IRON = slice(COEFFICIENTS + 10, COEFFICIENTS + 13)
 """Errors that turn with the vehicle, such as hard iron: forward, to the right and downward [nT] in the state."""
 STATES = COEFFICIENTS + 13
 """Number of states."""
-ANOMALY_KM = 125.0
+ANOMALY_KM = 250.0
 """Correlation length of the anomaly [km]. WMMHR, degrees 14 to 133 at the ground, has .9 at 50 km, .62 at 100 km and
 .28 at 150 km; for a ship, it is four hours of magnetic weather."""
 MODEL_NT = 2.0
@@ -367,8 +367,31 @@ def innovation(
         tensor([0.5000, -0.0000, 0.7000], dtype=torch.float64)
     """
     check_tensor(3, reading=reading, sensor_std=sensor_std)
-    reading, sensor_std = reading.double(), sensor_std.double()
-    present = (sensor_std < math.inf) & (reading == reading) & belief.measured
+    return predicted(belief, reading, sensor_std < math.inf, heading, errors).innovation(sensor_std)
+
+
+class Prediction(NamedTuple):
+    """An innovation but for the noise of the reading: residual, rows, covariance ``H P H^T``, that of what the model
+    leaves out, and which elements are read ``(..., 3)``."""
+
+    residual: Tensor
+    rows: Tensor
+    spread: Tensor
+    model: Tensor
+    present: Tensor
+
+    def innovation(self, sensor_std: Tensor) -> Innovation:
+        """Return the innovation with a noise of standard deviations ``(..., 3)``."""
+        variance = torch.where(self.present, sensor_std.double(), 1.0).square()
+        return Innovation(self.residual, self.rows, self.spread + (torch.diag_embed(variance) + self.model))
+
+
+def predicted(
+    belief: Belief, reading: Tensor, read: Tensor, heading: Tensor | None = None, errors: bool = True
+) -> Prediction:
+    """Return what :func:`innovation` returns but for the noise, where some elements ``(..., 3)`` are read."""
+    reading = reading.double()
+    present = read & (reading == reading) & belief.measured
     vector = field_vector(torch.where(present, reading, _elements(belief.field)))
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
     rows = pad(jacobian, (0, COEFFICIENTS - 3))
@@ -382,9 +405,8 @@ def innovation(
         rows = torch.cat((rows[..., :COEFFICIENTS], place, own, jacobian, jacobian @ turn), -1)
     rows = pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
     residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)  # y - H x
-    variance = torch.where(present, sensor_std, 1.0).square()
-    noise = torch.diag_embed(variance) + MODEL_NT**2 * jacobian @ jacobian.mT  # R
-    return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)
+    model = MODEL_NT**2 * jacobian @ jacobian.mT
+    return Prediction(residual, rows, rows @ belief.covariance @ rows.mT, model, present)
 
 
 def updated(belief: Belief, new: Innovation) -> Belief:

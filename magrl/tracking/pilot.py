@@ -37,20 +37,21 @@ from magrl.tracking.belief import (
     at_place,
     before,
     elements,
-    innovation,
     known,
     moved,
+    predicted,
     updated,
 )
 from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
 from magrl.tracking.destination import Destination, destination, posterior
+from magrl.tracking.earth import EarthModel
 from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
 from magrl.tracking.observation import track_observation, turned
 from magrl.tracking.planning import corrected, planned_move, step_price
 from magrl.tracking.records import Reading, Rules, State, Track
 from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
-from magrl.tracking.survey import surveyed
+from magrl.tracking.survey import anomaly_there, surveyed
 from magrl.tracking.way import Way
 
 PRICE_KM = 300.0
@@ -89,14 +90,17 @@ def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
     north = _declination(anomalies.mixture(beliefs, log_weight), reading)
     seen = _side_by_side(_true(reading, north))
     first = FIRST * seen.std.noise
-    new = innovation(beliefs, seen.field, first, seen.heading)
-    wide = spike_factor(new, first)
-    beliefs = updated(beliefs, innovation(beliefs, seen.field, first * wide, seen.heading))
+    prediction = predicted(beliefs, seen.field, first < math.inf, seen.heading)
+    new = prediction.innovation(first)
+    beliefs = updated(beliefs, prediction.innovation(first * spike_factor(new, first)))
     beliefs = anomalies.recentered(beliefs, log_weight)
     weights, home, quiet = arrival_weights(field, reading.target, rules.zeta), none[..., :2], 0 * beliefs.mean[..., :3]
     after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new, _count(beliefs, seen))
-    rest = quiet, quiet, unvisited_yet(field), weights, home[..., 0], home, _declination(after, reading)
-    return State(beliefs.mean, beliefs.covariance, after.place, log_weight, *rest), none[..., 0], tail
+    rest = quiet, quiet, unvisited_yet(field), weights, home[..., 0], home, _declination(after, reading), none[..., 0]
+    state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *rest)
+    if survey := _survey(rules, reading):
+        state = state._replace(there=anomaly_there(after, *survey, state.crust_nt, _true(reading, state.north).std))
+    return state, none[..., 0], tail
 
 
 def _first_beliefs(rules: Rules, reading: Reading) -> Belief:
@@ -121,10 +125,11 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     beliefs = moved(state.beliefs, seen.distance, heading, seen.std, rules.motion, sizes)
     if seen.leg_std is not None:
         beliefs = displaced(beliefs, _leg_covariance(seen.leg_std, heading))
-    stated, scaled = innovation(beliefs, field, std, heading), std * (own.log_ratio / 2).exp()
-    wide = spike_factor(innovation(beliefs, field, scaled, heading), scaled)
-    own = noise_estimate(own, innovation(beliefs, field, scaled * wide, heading), std * wide)
-    new = innovation(beliefs, field, std * own.factor * wide, heading)
+    prediction = predicted(beliefs, field, std < math.inf, heading)
+    stated, scaled = prediction.innovation(std), std * (own.log_ratio / 2).exp()
+    wide = spike_factor(prediction.innovation(scaled), scaled)
+    own = noise_estimate(own, prediction.innovation(scaled * wide), std * wide)
+    new = prediction.innovation(std * own.factor * wide)
     log_weight, count = anomalies.reweighed(state.log_weight, new), _count(beliefs, seen)
     tail = anomalies.tail(state.log_weight, new, count)
     beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
@@ -132,7 +137,7 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     after, heading = anomalies.mixture(beliefs, log_weight), one.heading
     move = reading.distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
     path, home, visited = state.path + reading.distance, state.home + move, visit(state.visited, move.to(state.visited))
-    rest = visited, state.weights, path, home, _declination(after, reading)
+    rest = visited, state.weights, path, home, _declination(after, reading), state.there
     state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *own, *rest)
     return state, surprise, tail
 
@@ -211,9 +216,17 @@ def _goal(rules: Rules, state: State, reading: Reading) -> Destination:
     if rules.target_km is None:
         return destination(belief, reading.target, rules.range_km, crust, errors, std)
     place = reading.target_place
-    if std is not None and rules.model is not None and place is not None:
-        belief = surveyed(belief, reading.target, std.to(place), place.double(), rules.model, crust, errors)
+    if survey := _survey(rules, reading):
+        belief = surveyed(belief, *survey, crust, errors, state.there)
     return destination(belief, reading.target, rules.range_km, crust, errors, place=place, place_km=rules.target_km)
+
+
+def _survey(rules: Rules, reading: Reading) -> tuple[Tensor, Tensor, Tensor, EarthModel] | None:
+    """Return the elements measured at the destination, their errors, its place and the model; None without any."""
+    place, std, model = reading.target_place, rules.target_std, rules.model
+    if rules.target_km is None or place is None or std is None or model is None:
+        return None
+    return reading.target, torch.tensor(std, dtype=torch.float64).to(place), place.double(), model
 
 
 def _accuracy(state: State, reading: Reading) -> SensorStd:
@@ -236,7 +249,7 @@ def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, t
     limits = rules.max_steps, rules.max_move_km
     price = step_price(percent, PRICE_KM, aim.double(), reading.step, std.noise, *limits)
     plan = planned_move(goal, points, aim.double(), std, price, rules.max_move_km, rules.caution).to(dtype)
-    return Track(state, points, way, local, aim, plan, surprise, tail)
+    return Track(state, points, way, local, aim, plan, surprise, tail, goal)
 
 
 def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:
@@ -294,7 +307,7 @@ def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> t
     state, left = track.state, rules.max_steps - 1 - reading.step
     price = rules.step_price if reading.price is None else reading.price
     trip = Trip(state.path, state.home, left, price, rules.max_move_km)
-    goal, std = _goal(rules, state, reading), _accuracy(state, reading)
+    goal, std = track.goal or _goal(rules, state, reading), _accuracy(state, reading)
     decision = arrival_decision(goal, track.posterior, std, trip, rules.radius_km)
     heading = _true(reading, state.north).heading.unsqueeze(-1)
     way, stop = (part.to(action.dtype) for part in (decision.way, decision.stop_km.unsqueeze(-1)))

@@ -12,7 +12,7 @@ from magrl.checks import CheckedModel
 from magrl.sensor_std import SensorStd
 from magrl.tracking import anomalies
 from magrl.tracking.belief import Belief, LocalElements, Motion
-from magrl.tracking.destination import RANGE_KM
+from magrl.tracking.destination import RANGE_KM, Destination
 from magrl.tracking.earth import EarthModel
 from magrl.tracking.noise import NoiseEstimate
 from magrl.tracking.planning import CAUTION, STEP_PRICE
@@ -163,7 +163,7 @@ class State(NamedTuple):
     their noise estimates ``(..., H, 3)`` twice; displacements to visited places ``(..., 24, 2)`` [km]; weights of the
     objective ``(..., 3)``; the path flown ``(...)`` and the displacement from the start ``(..., 2)`` [km]; and the
     angle of north ``(...)``, from the belief's north to the headings' north [rad]: D, where a compass and a place are
-    known."""
+    known; and the size ``(...)`` of an anomaly at the destination alone [nT]."""
 
     mean: Tensor
     covariance: Tensor
@@ -176,6 +176,7 @@ class State(NamedTuple):
     path: Tensor
     home: Tensor
     north: Tensor
+    there: Tensor
 
     @property
     def belief(self) -> Belief:
@@ -212,6 +213,7 @@ class Track(NamedTuple):
         surprise: ``(...)`` normalized square of the innovation by the stated noise, over the number of elements; about
             1 where all is right.
         tail: ``(...)`` probability of a reading that is more surprising, where everything stated is true.
+        goal: the destination as seen from the belief; None if it is to be computed again, as from a TensorDict.
     """
 
     state: State
@@ -222,3 +224,4 @@ class Track(NamedTuple):
     plan: Tensor
     surprise: Tensor
     tail: Tensor
+    goal: Destination | None = None

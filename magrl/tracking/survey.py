@@ -21,6 +21,9 @@ from magrl.tracking.harmonics import UNIT_KM
 from magrl.tracking.local import COEFFICIENTS, levers, slopes, unturned
 from magrl.tracking.prior import DEGREE, closure
 
+THERE_NT, THERE_PRIOR = (0.0, 30.0, 100.0, 300.0), (0.6, 0.25, 0.1, 0.05)
+"""Sizes of an anomaly at the destination alone [nT in each axis], and their probabilities; chosen."""
+
 
 def surveyed(
     belief: Belief,
@@ -30,6 +33,7 @@ def surveyed(
     model: EarthModel,
     crust_nt: Tensor,
     errors: SensorStd,
+    there_nt: Tensor | float = 0.0,
 ) -> Belief:
     """Return the belief given the measured elements of the destination.
 
@@ -45,7 +49,31 @@ def surveyed(
         model: of the belief.
         crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
+        there_nt: ``(...)`` standard deviation in each axis of an anomaly at the destination alone [nT].
     """
+    new, axis = _innovation(belief, elements, std, place, model, crust_nt, errors)
+    there = torch.as_tensor(there_nt).to(axis).square()[..., None, None] * axis
+    return settled(updated(belief, new._replace(covariance=new.covariance + there)))
+
+
+def anomaly_there(
+    belief: Belief, elements: Tensor, std: Tensor, place: Tensor, model: EarthModel, crust_nt: Tensor, errors: SensorStd
+) -> Tensor:
+    """Return the expected size ``(...)`` of an anomaly at the destination alone [nT], the root of the mean of the
+    squares, given the belief at a known start, where the model's error is known best. Arguments as of
+    :func:`surveyed`."""
+    new, axis = _innovation(belief, elements, std, place, model, crust_nt, errors)
+    square = torch.tensor(THERE_NT).to(axis).square()
+    covariance = new.covariance.unsqueeze(-3) + square[:, None, None] * axis.unsqueeze(-3)
+    each = Innovation(new.residual.unsqueeze(-2), new.rows.unsqueeze(-3), covariance)
+    weight = torch.tensor(THERE_PRIOR).to(axis).log() - (each.square() + torch.logdet(covariance)) / 2
+    return (torch.softmax(weight, -1) * square).sum(-1).sqrt()
+
+
+def _innovation(
+    belief: Belief, elements: Tensor, std: Tensor, place: Tensor, model: EarthModel, crust_nt: Tensor, errors: SensorStd
+) -> tuple[Innovation, Tensor]:
+    """Return the survey minus its prediction, and the covariance ``(..., 3, 3)`` of 1 nT in each axis there."""
     there = model.field(*place.unbind(-1)).to(belief.mean)
     rows, variance = _rows(belief, place, model, crust_nt, errors)
     jacobian, expected = elements_jacobian(there), torch.zeros_like(belief.mean)
@@ -58,7 +86,8 @@ def surveyed(
     noise = variance[..., None, None] * jacobian @ jacobian.mT + torch.diag(std.to(there).square())
     both = present.unsqueeze(-1) & present.unsqueeze(-2)
     noise = torch.where(both, noise, torch.eye(3).to(noise))
-    return settled(updated(belief, Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)))
+    axis = torch.where(both, jacobian @ jacobian.mT, 0.0)
+    return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise), axis
 
 
 def _rows(

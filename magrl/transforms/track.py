@@ -51,7 +51,7 @@ def reading_of(seen: TensorDictBase) -> Reading:
 def track_of(record: TensorDictBase) -> Track:
     """Return the track that :class:`TrackField` keeps under its first key."""
     parts = {"state": State, "posterior": DestinationPosterior, "way": Way, "local": LocalElements}
-    return Track(*(parts[name](**record[name]) if name in parts else record[name] for name in Track._fields))
+    return Track(*(parts[name](**record[name]) if name in parts else record[name] for name in Track._fields[:-1]))
 
 
 class TrackField(StatefulTransform):
@@ -149,7 +149,8 @@ def _leaves(dtype: torch.dtype) -> TensorDict:
 
 def _record(track: Track, batch: torch.Size) -> TensorDict:
     """Return a track as a nested TensorDict."""
-    parts = {key: value if isinstance(value, Tensor) else value._asdict() for key, value in track._asdict().items()}
+    kept = {key: value for key, value in track._asdict().items() if key != "goal"}
+    parts = {key: value if isinstance(value, Tensor) else value._asdict() for key, value in kept.items()}
     return TensorDict(parts, batch_size=batch)
 
 

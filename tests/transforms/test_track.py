@@ -49,6 +49,7 @@ def flown(env: TransformedEnv, steps: int = 5) -> TensorDictBase:
 
 def assert_equal(found: Track | list[Tensor], expected: Track | list[Tensor]) -> None:
     """Bit for bit; an unknown coordinate of the place is NaN."""
+    found, expected = (one._replace(goal=None) if isinstance(one, Track) else one for one in (found, expected))
     close(tree_leaves(found), tree_leaves(expected), rtol=0, atol=0)
 
 
