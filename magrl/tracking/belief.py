@@ -133,6 +133,11 @@ class Innovation(NamedTuple):
     rows: Tensor
     covariance: Tensor
 
+    def noisy(self, sensor_std: Tensor) -> Innovation:
+        """Return it with a noise of standard deviations ``(..., 3)``; a missing element has 1."""
+        variance = torch.where((self.rows == 0).all(-1), 1.0, sensor_std.double()).square()
+        return self._replace(covariance=self.covariance + torch.diag_embed(variance))
+
     def square(self) -> Tensor:
         """Return the normalized square ``(...)``: where the belief is right, chi-square of the elements present."""
         return (self.residual.unsqueeze(-2) @ inverse3(self.covariance) @ self.residual.unsqueeze(-1)).squeeze((-2, -1))
@@ -341,11 +346,7 @@ def _to_magnetic_north(belief: Belief) -> Belief:
 
 
 def innovation(
-    belief: Belief,
-    reading: Tensor,
-    sensor_std: Tensor,
-    heading: Tensor | None = None,
-    errors: bool = True,
+    belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | None = None, errors: bool = True
 ) -> Innovation:
     """Return the innovation of a reading: residual y - H x, rows H, and covariance S = H P H^T + R.
 
@@ -367,46 +368,27 @@ def innovation(
         tensor([0.5000, -0.0000, 0.7000], dtype=torch.float64)
     """
     check_tensor(3, reading=reading, sensor_std=sensor_std)
-    return predicted(belief, reading, sensor_std < math.inf, heading, errors).innovation(sensor_std)
-
-
-class Prediction(NamedTuple):
-    """An innovation but for the noise of the reading: residual, rows, covariance ``H P H^T``, that of what the model
-    leaves out, and which elements are read ``(..., 3)``."""
-
-    residual: Tensor
-    rows: Tensor
-    spread: Tensor
-    model: Tensor
-    present: Tensor
-
-    def innovation(self, sensor_std: Tensor) -> Innovation:
-        """Return the innovation with a noise of standard deviations ``(..., 3)``."""
-        variance = torch.where(self.present, sensor_std.double(), 1.0).square()
-        return Innovation(self.residual, self.rows, self.spread + (torch.diag_embed(variance) + self.model))
+    return predicted(belief, reading, sensor_std < math.inf, heading, errors).noisy(sensor_std)
 
 
 def predicted(
     belief: Belief, reading: Tensor, read: Tensor, heading: Tensor | None = None, errors: bool = True
-) -> Prediction:
-    """Return what :func:`innovation` returns but for the noise, where some elements ``(..., 3)`` are read."""
+) -> Innovation:
+    """Return an :func:`innovation` without the noise of the reading, where some elements ``(..., 3)`` are read."""
     reading = reading.double()
     present = read & (reading == reading) & belief.measured
     vector = field_vector(torch.where(present, reading, _elements(belief.field)))
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
     rows = pad(jacobian, (0, COEFFICIENTS - 3))
     if errors:
-        own, course = (
-            torch.diag_embed(present.double()).expand_as(jacobian),
-            torch.zeros_like(reading[..., 0]) if heading is None else heading,
-        )
+        own = torch.diag_embed(present.double()).expand_as(jacobian)
+        course = torch.zeros_like(reading[..., 0]) if heading is None else heading
         turn = turning(torch.cos(course.double()), torch.sin(course.double()), 1)  # forward, right, down
         place = torch.zeros_like(rows[..., :4])
         rows = torch.cat((rows[..., :COEFFICIENTS], place, own, jacobian, jacobian @ turn), -1)
     rows = pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
     residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)  # y - H x
-    model = MODEL_NT**2 * jacobian @ jacobian.mT
-    return Prediction(residual, rows, rows @ belief.covariance @ rows.mT, model, present)
+    return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + MODEL_NT**2 * jacobian @ jacobian.mT)
 
 
 def updated(belief: Belief, new: Innovation) -> Belief:

@@ -91,8 +91,8 @@ def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
     seen = _side_by_side(_true(reading, north))
     first = FIRST * seen.std.noise
     prediction = predicted(beliefs, seen.field, first < math.inf, seen.heading)
-    new = prediction.innovation(first)
-    beliefs = updated(beliefs, prediction.innovation(first * spike_factor(new, first)))
+    new = prediction.noisy(first)
+    beliefs = updated(beliefs, prediction.noisy(first * spike_factor(new, first)))
     beliefs = anomalies.recentered(beliefs, log_weight)
     weights, home, quiet = arrival_weights(field, reading.target, rules.zeta), none[..., :2], 0 * beliefs.mean[..., :3]
     after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new, _count(beliefs, seen))
@@ -126,10 +126,10 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     if seen.leg_std is not None:
         beliefs = displaced(beliefs, _leg_covariance(seen.leg_std, heading))
     prediction = predicted(beliefs, field, std < math.inf, heading)
-    stated, scaled = prediction.innovation(std), std * (own.log_ratio / 2).exp()
-    wide = spike_factor(prediction.innovation(scaled), scaled)
-    own = noise_estimate(own, prediction.innovation(scaled * wide), std * wide)
-    new = prediction.innovation(std * own.factor * wide)
+    stated, scaled = prediction.noisy(std), std * (own.log_ratio / 2).exp()
+    wide = spike_factor(prediction.noisy(scaled), scaled)
+    own = noise_estimate(own, prediction.noisy(scaled * wide), std * wide)
+    new = prediction.noisy(std * own.factor * wide)
     log_weight, count = anomalies.reweighed(state.log_weight, new), _count(beliefs, seen)
     tail = anomalies.tail(state.log_weight, new, count)
     beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
