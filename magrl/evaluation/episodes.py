@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
@@ -29,17 +32,18 @@ LARGE_KEYS = [(*root, *key) for root in ((), ("next",)) for key in _LARGE]
 """Keys that rollouts leave out."""
 
 
-def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
+def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bool = False) -> TensorDict:
     """Return a rollout of exactly one episode of each vehicle, without exploration or gradients.
 
-    A stochastic policy acts by its deterministic sample. It is the first episode of each vehicle: tasks, start headings
-    and sensor noise are the same in every call. From its first action that is not finite on, the actions of a vehicle
-    are zeros, with a warning that names it.
+    A stochastic policy acts by its deterministic sample, and modules are in their mode ``eval()``. It is the first
+    episode of each vehicle: tasks, start headings and sensor noise are the same in every call. From its first action
+    on that is not finite in float32, a vehicle stands still, with a warning that names it.
 
     Args:
         env: navigation environment, with transforms or without; :func:`~magrl.navigators.policy_env` adds what the
             policy needs.
         policy: policy or navigator that writes ``action``.
+        strict: whether to raise at the first action that is not finite.
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
@@ -48,7 +52,8 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
 
     Raises:
         TypeError: for another environment, or a policy that is not callable.
-        ValueError: for a trained policy that does not fit the environment (:meth:`magrl.FieldPolicy.check_fits`).
+        ValueError: for a trained policy that does not fit the environment (:meth:`magrl.FieldPolicy.check_fits`), or
+            ``strict``, naming vehicles and step.
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=3)
@@ -61,15 +66,18 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
     if isinstance(policy, Navigator):
         policy.check_fits(env)
     env = policy_env(env, policy)
-    failed = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
+    failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
+    steps: list[TensorDictBase] = []
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         action = policy(tensordict)["action"]
-        failed.logical_or_(~torch.isfinite(action).all(-1, keepdim=True))
-        return tensordict.set("action", torch.where(failed, 0.0, action))
+        failed.logical_or_(~torch.isfinite(action.float()).all(-1, keepdim=True))
+        if strict and failed.any():
+            step = f"step {len(steps)} (the first is step 0)"
+            raise ValueError(f"the agent's action is not finite: vehicles {_first(failed)} at {step}")
+        return tensordict.set("action", torch.where(failed, still, action))
 
-    steps: list[TensorDictBase] = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _evaluating(policy):
         state = env.reset()
         while len(steps) < env.max_steps and not (steps and steps[-1]["next", "done"].all()):
             step = env.step(act(state))
@@ -77,9 +85,36 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
             state = step_mdp(step)
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():
-        lost = failed.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
+        lost = _first(failed)
         warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=2)
     return rollout
+
+
+@contextmanager
+def _evaluating(policy: Any) -> Iterator[None]:
+    """Keep the modules of a policy in their mode ``eval()``, and give each its own mode back."""
+    modes = [(part, part.training) for part in policy.modules()] if isinstance(policy, nn.Module) else []
+    for part, _ in modes:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part, mode in modes:
+            part.training = mode
+
+
+def _still(env: EnvBase) -> Tensor:
+    """Return the action of vehicles that stand still and do not declare: the least distance, scaled or not."""
+    spec = env.action_spec
+    action = spec.zero()
+    if isinstance(spec, Bounded):
+        action[..., 0] = spec.space.low[..., 0]
+    return action
+
+
+def _first(mask: Tensor) -> list[int]:
+    """Return the first eight vehicles of a mask ``(N, 1)``."""
+    return mask.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
 
 
 def restart(env: EnvBase) -> None:
