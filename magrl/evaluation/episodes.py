@@ -187,7 +187,8 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
         and ``path_efficiency`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior
         angle at waypoints (180 is straight, NaN without waypoints); ``heading_mae_deg`` and ``heading_rmse_deg``,
         deviations from the bearing to the destination over the legs of nonzero length (NaN without any). Where vehicles
-        declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
+        declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success; and
+        ``not_declared`` bool: it ran out of steps without one.
 
     Raises:
         TypeError: for a rollout of another type.
@@ -226,6 +227,8 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     if "declared" in rollout["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
         declared = rollout["next", "declared"].squeeze(2).gather(1, last).squeeze(1)
         measures["false_arrival"] = declared & ~success
+        truncated = rollout["next", "truncated"].squeeze(2).gather(1, last).squeeze(1)
+        measures["not_declared"] = truncated & ~declared
     return measures
 
 
@@ -272,7 +275,8 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
         ``spl_high``, likewise ``path_efficiency`` over the episodes that moved;
         ``trajectory_length_m``, ``steps``, ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
         ``heading_rmse_deg`` over successes, probably as in the paper; ``num_tasks``. Means over no episode are NaN.
-        Where vehicles declare their arrival, also ``false_arrival_rate`` [%] with its Wilson 95 % interval.
+        Where vehicles declare their arrival, also ``false_arrival_rate`` and ``not_declared_rate`` [%] with Wilson 95 %
+        intervals.
 
     Raises:
         ValueError: for no episode, or ``success`` that is not bool.
@@ -300,8 +304,9 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     summary["steps"] = episodes["steps"][success].double().mean().item()
     for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
         summary[name] = episodes[name][success].nanmean().item()
-    if "false_arrival" in episodes:
-        summary |= _rate("false_arrival_rate", episodes["false_arrival"])
+    for name in ("false_arrival", "not_declared"):
+        if name in episodes:
+            summary |= _rate(f"{name}_rate", episodes[name])
     return summary | {"num_tasks": len(success)}
 
 
