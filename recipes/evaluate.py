@@ -85,8 +85,8 @@ class Config(ScenarioOptions):
     """Model of the Earth that vehicles carry, of the date: IGRF-14, IGRF-13, IGRF-2005, ...; none by default."""
     start_km: float | None = None
     """Error of the start as vehicles know it, with a model [km]; by default they do not know their start."""
-    confidence: float = 0.0
-    """Minimum probability of a correct declaration, with --arrival declared; 0 by default."""
+    confidence: float = 0.5
+    """Minimum estimated probability at which vehicles declare, with --arrival declared."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
     device: str = "cpu"
@@ -179,7 +179,9 @@ def evaluate(config: Config) -> str:
         number = len(results.summaries.setdefault(kind, []))
         results.summaries[kind].append(summary)
         results.runs.append({"navigator": name, "run": number, "source": run, **summary})
-        columns = {key: measured[key].tolist() for key in (*MEASURES, "false_arrival") if key in measured}
+        columns = {
+            key: measured[key].tolist() for key in (*MEASURES, "false_arrival", "not_declared") if key in measured
+        }
         results.episodes += [
             {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
             for task in range(flight.base.num_envs)
@@ -201,7 +203,7 @@ def settings(config: Config, flight: Flight) -> dict[str, Any]:
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
         "north": north(flight),
-        **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "confidence", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **env.scenario.model_dump(include={*RULES, "altitude_km"}),
     }
@@ -216,8 +218,9 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
     """Return what is written below a table: the errors of the vehicles, their rule of arrival, and notes."""
     env = flight.base
     text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
+    sure = f", at a probability of {config.confidence:g}" * env.scenario.declared
     lines = {
-        "Arrival": env.arrival != "objective" and f"{env.arrival}, within {env.scenario.radius_km:g} km",
+        "Arrival": env.arrival != "objective" and f"{env.arrival}, within {env.scenario.radius_km:g} km{sure}",
         "North": north(flight) != "true" and north(flight),
         "Conditions": isinstance(config.errors, str) and config.errors,
         "Model of the Earth": config.model or "",

@@ -68,6 +68,8 @@ class Config:
     """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
     start_km: float | None = None
     """Error of the start as the vehicle knows it, with a model [km]; by default it does not know its start."""
+    confidence: float = 0.5
+    """Minimum estimated probability at which the vehicle declares its arrival."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
@@ -156,6 +158,7 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
                 start_heading="random",
                 seed=config.seed,
                 arrival=arrival,
+                confidence=config.confidence,
             )
             navigator = flight.navigator(config.navigator)
             flights[name] = flight.env_of(navigator, track=True), Watched(navigator, distance_km)
@@ -181,11 +184,14 @@ def rollout(env: EnvBase, navigator: Watched, start_heading: float | Literal["ra
 def outcome(steps: TensorDictBase) -> str:
     """Return how a flight ended."""
     last = steps["next"][0, -1]
-    if last.get("declared", torch.zeros(1, dtype=torch.bool)).item():
+    declared = last.get("declared", None)
+    if declared is not None and declared.item():
         return "declared its arrival" + ("" if last["success"].item() else ", falsely")
     if last["success"].item():
         return "arrived"
-    return "left the region" if last["terminated"].item() else "reached the step limit"
+    if last["terminated"].item():
+        return "left the region"
+    return "reached the step limit" if declared is None else "not declared"
 
 
 def draw(
@@ -248,9 +254,7 @@ def summary(result: dict[str, Any]) -> str:
         "start": ends[0],
         "destination": f"{ends[1]}, {elements}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",
-        "path": f"{result['length_km']:.0f} km; the shortest is {result['shortest_km']:.0f} km",
-        "efficiency": f"{100 * result['path_efficiency']:.1f} %",
-        "distance left": f"{result['navigation_error_km']:.1f} km",
+        "path": "{length_km:.0f} km flown, {navigation_error_km:.1f} km left of {shortest_km:.0f}".format(**result),
         "without signal": "{outcome}: {steps} steps, {length_km:.0f} km, {navigation_error_km:.1f} km left, "
         "estimated to {ellipse}".format(**result["without_signal"]),
     }

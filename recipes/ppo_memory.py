@@ -27,7 +27,7 @@ from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, PlanetConfig, Positive, Widths
 from magrl.training.run import make_collector
 from magrl.transforms.areas import turned
-from magrl.transforms.sequences import READING_SIZE
+from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE
 
 import torch
 from tensordict import TensorDictBase
@@ -106,6 +106,12 @@ def evaluation_env(scenario: Scenario, num_tasks: int, tasks_seed: int, seed: in
     return task_env(tasks, config, num_envs=num_tasks, seed=seed, observation="dict", scale_actions=False)
 
 
+def accuracy_range(seen: TensorDictBase) -> list[list[float]]:
+    """Return the least and the largest accuracy of the sensors in a batch, as :class:`Memory` takes it."""
+    stds = torch.cat([seen.get(key, torch.zeros_like(seen["field"])) for key in ACCURACY_KEYS], -1)
+    return [stds.amin(0).tolist(), stds.amax(0).tolist()]
+
+
 class Leg(nn.Module):
     """The action in [-1, 1] of an estimate and its correction."""
 
@@ -180,7 +186,7 @@ def train(config: Config) -> dict[str, float]:
         frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
         collector = make_collector(env, TensorDictSequential(memory, correction, leg), **frames)
         parts = {"loss": loss, "optimizer": optimizer, "memory_optimizer": memory_optimizer, "spread": spread}
-        policy = Memory(network)
+        policy = Memory(network, accuracy_range(validation.reset()))
         run.start(policy=policy, validation=validation, env=env.base_env, collector=collector, memory=memory, **parts)
         stats, clip = run.statistics, config.clip_gradient
         for batch in run.batches():

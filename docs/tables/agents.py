@@ -3,7 +3,7 @@
     pip install -c constraints.txt -e '.[recipes,onnx]'
     python docs/tables/agents.py docs/results/agents/*    # a minute
 
-A file is named by its task and algorithm, as in ``box-PPO.onnx``. Intervals are over the 200 episodes.
+A file is named by its task and algorithm, as in ``box-PPO.onnx``. Intervals are over 200 episodes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from magrl.training import command
 import tyro
 from pandas import DataFrame
 from torch import Tensor, nn
+
+EPISODES = 200
+"""Episodes of a score."""
 
 
 class Acting(nn.Module):
@@ -64,7 +67,7 @@ def main(files: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     rows = []
     for file in files:
         task, _, name = file.stem.partition("-")
-        found = {key: f"{value:.1f}" for key, value in score(file, task).items()}
+        found = {key: f"{value:.1f}" for key, value in score(file, task, episodes=EPISODES).items()}
         interval = f"{found['SPL']} ({found['SPL_low']}–{found['SPL_high']})"
         rows.append([task, name, found["SR"], interval, found["return"], found["steps"], found["beyond_50km"]])
     print(markdown_table(["task", "agent", "SR %", "SPL %", "return", "steps", "beyond 50 km %"], rows))

@@ -117,7 +117,7 @@ def exported(actor: nn.Module, size: int) -> OnnxNetwork:
     """
     _library("onnxscript")
     draw = torch.Generator().manual_seed(0)
-    observation = 2 * torch.rand(_CHECKED, size, generator=draw) - 1
+    observation = 2 * torch.rand(_CHECKED, size, generator=draw, dtype=torch.float32) - 1
     modes, validated = {part: part.training for part in actor.modules()}, Distribution._validate_args
     Distribution.set_default_validate_args(False)  # validation reads values, which a trace has not
     try:

@@ -22,12 +22,12 @@ from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
-from magrl.checks import check_device, check_finite, check_type
+from magrl.checks import check_device, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.scenario import rule_settings
 from magrl.files import save_tensors, write_atomically
 from magrl.navigators import Anywhere, Memory, Navigator
-from magrl.tracking.network import FILE_FORMAT, policy_content, save_pilot
+from magrl.tracking.network import FILE_FORMAT, check_weights, policy_content, save_pilot
 from magrl.transforms import ObservationView, ReadingView
 
 View = ObservationView | ReadingView
@@ -296,7 +296,7 @@ def _rebuild(config: Any, weights: Any, training: Any = None) -> FieldPolicy:
     rebuilt = _config(**config)
     # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
     rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
-    check_finite(weights.items(), "weights")
+    check_weights(weights)
     policy = FieldPolicy(rebuilt)
     policy.actor.load_state_dict(weights)
     policy.training = TrainingSettings(**training or {}).model_dump(exclude_unset=True)

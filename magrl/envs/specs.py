@@ -210,11 +210,12 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
     if torch.compiler.is_compiling() or action.is_cuda:
         torch._assert_async(sound.all(), "GeomagneticNavEnv: an action is not finite or out of bounds")
     elif not sound.all():
-        bad = (~sound.all(-1)).nonzero().squeeze(-1)
+        bad = (~sound.all(-1)).nonzero().squeeze(-1)[:8]
+        scaled = (2 * (action[bad] - low) / (high - low) - 1).double().round(decimals=6)
         raise ValueError(
-            f"GeomagneticNavEnv: actions of vehicles {bad[:8].tolist()} are not finite or out of bounds: "
-            f"{action[bad[:8]].tolist()}; distance [km] must be in [0, {float(high[0])}] and turn [rad] in "
-            f"[-{float(high[1]):.4f}, {float(high[1]):.4f}]{', declare in [-1, 1]' * (len(high) > 2)}"
+            f"GeomagneticNavEnv: actions of vehicles {bad.tolist()} are not finite or out of bounds, {scaled.tolist()} "
+            f"in [-1, 1]: clip them; or {action[bad].tolist()} as distance [0, {float(high[0])}] km and turn "
+            f"[-{float(high[1]):.4f}, {float(high[1]):.4f}] rad{', declare [-1, 1]' * (len(high) > 2)}"
         )
     return action.clamp(low, high)
 

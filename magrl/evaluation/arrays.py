@@ -85,10 +85,13 @@ class ArrayPolicy(Navigator):
 def _checked(actions: Any, count: int) -> Tensor:
     """Return actions as float32; raise unless they are finite numbers ``(count, 2)`` or ``(count, 3)``."""
     array = np.asarray(actions)
-    if array.shape not in [(count, 2), (count, 3)] or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+    sound = array.shape in [(count, 2), (count, 3)] and array.dtype.kind in "fiu"
+    with np.errstate(over="ignore"):
+        rounded = array.astype(np.float32) if sound else array
+    if not sound or not np.isfinite(rounded).all():
         wanted = f"finite numbers of shape ({count}, 2), a vehicle per row"
         raise ValueError(f"actions must be {wanted}, got {array.dtype} {array.shape}: {short(array.tolist())}")
-    return torch.from_numpy(array.astype(np.float32))
+    return torch.from_numpy(rounded)
 
 
 def _axis_of(array: Any, count: int) -> int:

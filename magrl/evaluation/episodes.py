@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
@@ -29,17 +32,18 @@ LARGE_KEYS = [(*root, *key) for root in ((), ("next",)) for key in _LARGE]
 """Keys that rollouts leave out."""
 
 
-def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
+def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bool = False) -> TensorDict:
     """Return a rollout of exactly one episode of each vehicle, without exploration or gradients.
 
-    A stochastic policy acts by its deterministic sample. It is the first episode of each vehicle: tasks, start headings
-    and sensor noise are the same in every call. From its first action that is not finite on, the actions of a vehicle
-    are zeros, with a warning that names it.
+    A stochastic policy acts by its deterministic sample, and modules are in their mode ``eval()``. It is the first
+    episode of each vehicle: tasks, start headings and sensor noise are the same in every call. From its first action
+    on that is not finite in float32, a vehicle stands still, with a warning that names it.
 
     Args:
         env: navigation environment, with transforms or without; :func:`~magrl.navigators.policy_env` adds what the
             policy needs.
         policy: policy or navigator that writes ``action``.
+        strict: whether to raise at the first action that is not finite.
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
@@ -48,7 +52,8 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
 
     Raises:
         TypeError: for another environment, or a policy that is not callable.
-        ValueError: for a trained policy that does not fit the environment (:meth:`magrl.FieldPolicy.check_fits`).
+        ValueError: for a trained policy that does not fit the environment (:meth:`magrl.FieldPolicy.check_fits`), or
+            ``strict``, naming vehicles and step.
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=3)
@@ -61,15 +66,18 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
     if isinstance(policy, Navigator):
         policy.check_fits(env)
     env = policy_env(env, policy)
-    failed = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
+    failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
+    steps: list[TensorDictBase] = []
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         action = policy(tensordict)["action"]
-        failed.logical_or_(~torch.isfinite(action).all(-1, keepdim=True))
-        return tensordict.set("action", torch.where(failed, 0.0, action))
+        failed.logical_or_(~torch.isfinite(action.float()).all(-1, keepdim=True))
+        if strict and failed.any():
+            step = f"step {len(steps)} (the first is step 0)"
+            raise ValueError(f"the agent's action is not finite: vehicles {_first(failed)} at {step}")
+        return tensordict.set("action", torch.where(failed, still, action))
 
-    steps: list[TensorDictBase] = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _evaluating(policy):
         state = env.reset()
         while len(steps) < env.max_steps and not (steps and steps[-1]["next", "done"].all()):
             step = env.step(act(state))
@@ -77,9 +85,36 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
             state = step_mdp(step)
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():
-        lost = failed.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
+        lost = _first(failed)
         warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=2)
     return rollout
+
+
+@contextmanager
+def _evaluating(policy: Any) -> Iterator[None]:
+    """Keep the modules of a policy in their mode ``eval()``, and give each its own mode back."""
+    modes = [(part, part.training) for part in policy.modules()] if isinstance(policy, nn.Module) else []
+    for part, _ in modes:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part, mode in modes:
+            part.training = mode
+
+
+def _still(env: EnvBase) -> Tensor:
+    """Return the action of vehicles that stand still and do not declare: the least distance, scaled or not."""
+    spec = env.action_spec
+    action = spec.zero()
+    if isinstance(spec, Bounded):
+        action[..., 0] = spec.space.low[..., 0]
+    return action
+
+
+def _first(mask: Tensor) -> list[int]:
+    """Return the first eight vehicles of a mask ``(N, 1)``."""
+    return mask.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
 
 
 def restart(env: EnvBase) -> None:
@@ -152,7 +187,8 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
         and ``path_efficiency`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior
         angle at waypoints (180 is straight, NaN without waypoints); ``heading_mae_deg`` and ``heading_rmse_deg``,
         deviations from the bearing to the destination over the legs of nonzero length (NaN without any). Where vehicles
-        declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
+        declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success; and
+        ``not_declared`` bool: it ran out of steps without one.
 
     Raises:
         TypeError: for a rollout of another type.
@@ -191,6 +227,8 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     if "declared" in rollout["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
         declared = rollout["next", "declared"].squeeze(2).gather(1, last).squeeze(1)
         measures["false_arrival"] = declared & ~success
+        truncated = rollout["next", "truncated"].squeeze(2).gather(1, last).squeeze(1)
+        measures["not_declared"] = truncated & ~declared
     return measures
 
 
@@ -237,7 +275,8 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
         ``spl_high``, likewise ``path_efficiency`` over the episodes that moved;
         ``trajectory_length_m``, ``steps``, ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
         ``heading_rmse_deg`` over successes, probably as in the paper; ``num_tasks``. Means over no episode are NaN.
-        Where vehicles declare their arrival, also ``false_arrival_rate`` [%] with its Wilson 95 % interval.
+        Where vehicles declare their arrival, also ``false_arrival_rate`` and ``not_declared_rate`` [%] with Wilson 95 %
+        intervals.
 
     Raises:
         ValueError: for no episode, or ``success`` that is not bool.
@@ -265,8 +304,9 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     summary["steps"] = episodes["steps"][success].double().mean().item()
     for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
         summary[name] = episodes[name][success].nanmean().item()
-    if "false_arrival" in episodes:
-        summary |= _rate("false_arrival_rate", episodes["false_arrival"])
+    for name in ("false_arrival", "not_declared"):
+        if name in episodes:
+            summary |= _rate(f"{name}_rate", episodes[name])
     return summary | {"num_tasks": len(success)}
 
 

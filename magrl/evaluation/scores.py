@@ -29,7 +29,7 @@ FAR_KM = 50
 """Distance from the destination beyond which the end of a success is far [km]: the longest leg of the paper."""
 
 
-def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> dict[str, float]:
+def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **options: Any) -> dict[str, float]:
     """Return the score of an agent on a named task: the first episode of each vehicle, without exploration.
 
     Args:
@@ -58,7 +58,8 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
 
     Raises:
         TypeError: for an agent of another kind.
-        ValueError: for an unknown task or navigator, or actions of another shape or that are not finite.
+        ValueError: for an unknown task or navigator, or actions of another shape or that are not finite in
+            float32, naming vehicles and step.
 
     Example:
         >>> def straight(observations):
@@ -71,17 +72,18 @@ def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **opt
     return scored(flown(agent, task_name(task), episodes=episodes, seed=seed, **options))
 
 
-def flown(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> TensorDict:
+def flown(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **options: Any) -> TensorDict:
     """Return the rollout of :func:`score`, as :func:`magrl.evaluation.episode_measures` takes it."""
     policy, make = _policy(agent), partial(NAMED_ENVS[task_name(task)], episodes, seed=seed, **options)
     if isinstance(policy, str) or "observation" not in policy.in_keys:
         env = make(observation="dict", scale_actions=False)
         policy = make_navigator(policy, env.base_env) if isinstance(policy, str) else policy
-        return evaluation_rollout(env, policy.fitted(env.base_env, {}) if isinstance(policy, Navigator) else policy)
+        policy = policy.fitted(env.base_env, {}) if isinstance(policy, Navigator) else policy
+        return evaluation_rollout(env, policy, strict=True)
     env = make()
     if "observation" not in env.observation_spec.keys():  # noqa: SIM118 - a Composite is no mapping
         raise ValueError(f"the agent reads 'observation', which observation={options['observation']!r} leaves out")
-    return evaluation_rollout(env, policy)
+    return evaluation_rollout(env, policy, strict=True)
 
 
 def scored(rollout: TensorDictBase) -> dict[str, float]:

@@ -37,13 +37,14 @@ COLUMNS = {
     "within 25 km %": ("success_rate_within_25km", ".1f"),
     "final distance, median km": ("final_distance_km_median", ".1f"),
     "false arrivals %": ("false_arrival_rate", ".1f"),
+    "not declared %": ("not_declared_rate", ".1f"),
     "smoothness °": ("smoothness_deg", ".1f"),
     "MAE °": ("heading_mae_deg", ".1f"),
     "readings": ("field_readings", ".0f"),
 }
 """Heading, measure of :func:`cell` and number format of :func:`comparison_table`; the first four are the paper's."""
 
-SHORT_COLUMNS = ("SR %", "SPL %", "TNT steps", "NE km", "false arrivals %")
+SHORT_COLUMNS = ("SR %", "SPL %", "TNT steps", "NE km", "false arrivals %", "not declared %")
 """Headings of :func:`short_table`."""
 
 INTERVALS = ("success_rate", "spl", "path_efficiency", "steps")

@@ -143,7 +143,8 @@ class WeatherRecord:
         if not torch.isfinite(self.variation).all():
             raise ValueError(f"surrogates need a record without gaps, {self.name!r} has some")
         length, spectrum = len(self.variation), torch.fft.rfft(self.variation.double(), dim=0)
-        phase = 2 * math.pi * torch.rand(number, len(spectrum), 1, generator=torch.Generator().manual_seed(seed))
+        draw = torch.Generator().manual_seed(seed)
+        phase = 2 * math.pi * torch.rand(number, len(spectrum), 1, generator=draw, dtype=torch.float32)
         turned = torch.polar(torch.ones_like(phase), phase)
         real = turned.real.sign().to(turned)  # the mean and, of an even number, the highest frequency stay real
         turned[:, 0] = real[:, 0]

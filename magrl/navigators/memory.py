@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,18 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from magrl.checks import check_finite, check_number
+from magrl.checks import check_number
 from magrl.files import save_tensors
 from magrl.geodesy import polar, steer
 from magrl.navigators.base import Navigator
-from magrl.tracking.network import FILE_FORMAT, correction_network, policy_content, pretrained
+from magrl.tracking.network import (
+    FILE_FORMAT,
+    check_entries,
+    check_weights,
+    correction_network,
+    policy_content,
+    pretrained,
+)
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE, observed_reading
 
 LIMITS = {"max_move_km": 50.0, "max_turn_rad": math.pi / 2}
@@ -78,15 +86,18 @@ def action_of(leg: Tensor, heading: Tensor, max_move_km: float, max_turn_rad: fl
 class Memory(Navigator):
     """The agent with a memory, which ``recipes/ppo_memory.py`` trains on random planets.
 
-    It reads what its sensors measure, their stated accuracy, and its own legs.
+    It reads what its sensors measure, their stated accuracy, and its own legs. An accuracy outside of its training's
+    range is taken as the nearest one in it.
 
     Args:
         source: file of :meth:`save`, or a :class:`MemoryNetwork`; the pretrained agent by default, of *Storm*.
+        accuracy: least and largest standard deviations of the training, six each: of errors that are new in each
+            reading, and of all others. Those of the file by default; any, with a network.
         limits: longest leg [km] and largest turn [rad]: at most the training's limits.
 
     Raises:
         FileNotFoundError: for a missing file.
-        ValueError: for a file of another kind, or a limit out of its range.
+        ValueError: for a file of another kind, or a limit or an accuracy out of its range.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -102,23 +113,37 @@ class Memory(Navigator):
     trained_on = "random planets"
     optional_keys = ACCURACY_KEYS
 
-    def __init__(self, source: MemoryNetwork | Path | str | None = None, **limits: float) -> None:
+    accuracy: Tensor
+
+    def __init__(
+        self,
+        source: MemoryNetwork | Path | str | None = None,
+        accuracy: Sequence[Sequence[float]] | None = None,
+        **limits: float,
+    ) -> None:
         super().__init__(**{name: min(limits.get(name, limit), limit) for name, limit in LIMITS.items()})
         self.in_keys = ["field", "target_field", "move", "heading", "elapsed_steps"]
-        self.network = source if isinstance(source, MemoryNetwork) else self._read(source or pretrained(self.name))
+        network, known = (source, None) if isinstance(source, MemoryNetwork) else self._read(source)
+        self.network = network.float()  # environments write float32
+        self.register_buffer("accuracy", _ends(accuracy or known), persistent=False)
 
-    @staticmethod
-    def _read(path: Path | str) -> MemoryNetwork:
+    @classmethod
+    def _read(cls, path: Path | str | None) -> tuple[MemoryNetwork, Sequence[Sequence[float]] | None]:
+        path = path or pretrained(cls.name)
         content = policy_content(path)
         try:
-            size, weights = content["memory"]["size"], content["weights"]
+            check_entries(content, "memory", "weights")
+            described, weights = {"accuracy": None, **content["memory"]}, content["weights"]
+            check_entries(described, "size", "accuracy")
+            size, accuracy = described["size"], described["accuracy"]
+            _ends(accuracy)
             # Compares the shapes before anything is allocated: a few bytes may ask for any size
             network = MemoryNetwork(size, "meta")
             network.load_state_dict(weights, assign=True)
-            check_finite(weights.items(), "weights")
+            check_weights(weights)
         except Exception as error:  # whatever foreign content raises
             raise ValueError(f"{path} does not hold a valid memory: {' '.join(str(error).split())}") from error
-        return network.float().requires_grad_(False).eval()
+        return network.requires_grad_(False).eval(), accuracy
 
     def save(self, path: Path | str) -> None:
         """Write the network, for the argument ``source``.
@@ -126,21 +151,33 @@ class Memory(Navigator):
         Raises:
             OSError: if the file cannot be written.
         """
-        content: dict[str, Any] = {"format": FILE_FORMAT, "memory": {"size": self.network.size}}
+        described: dict[str, Any] = {"size": self.network.size}
+        if self.accuracy.isfinite().all():
+            described["accuracy"] = self.accuracy.flatten(1).tolist()
+        content: dict[str, Any] = {"format": FILE_FORMAT, "memory": described}
         save_tensors(content | {"weights": dict(self.network.state_dict())}, Path(path))
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return an empty memory, and the first reading."""
-        hidden = torch.zeros(len(seen), 1, self.network.size, device=seen.device)
+        hidden = torch.zeros(len(seen), 1, self.network.size, dtype=torch.float32, device=seen.device)
         return {"hidden": hidden, "before": seen["field"].clone()}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
         """Return distance [km] and turn [rad]."""
         reading, heading = seen["field"], seen["heading"]
-        accuracy = [seen.get(key, torch.zeros_like(reading)) for key in ACCURACY_KEYS]
+        stated = [seen.get(key, torch.zeros_like(reading)) for key in ACCURACY_KEYS]
+        accuracy = [std.clamp(*ends) for std, ends in zip(stated, self.accuracy.unbind(1), strict=True)]
         observed = observed_reading(
             reading, seen["target_field"], seen["move"][..., :1], heading, accuracy, memory["before"]
         )
         leg, hidden = self.network(observed, memory["hidden"])
         memory.update({"hidden": hidden, "before": reading})
         return action_of(leg, heading, self.max_move_km, self.max_turn_rad)
+
+
+def _ends(accuracy: Sequence[Sequence[float]] | None) -> Tensor:
+    """Return the least and largest accuracy ``(2, 2, 3)`` by key of :data:`ACCURACY_KEYS`; raise for another range."""
+    low, high = ([0.0] * 6, [math.inf] * 6) if accuracy is None else accuracy
+    if len(low) != 6 or len(high) != 6 or not all(0 <= least <= most for least, most in zip(low, high, strict=True)):
+        raise ValueError(f"accuracy must be six standard deviations and six that are not less, got {accuracy}")
+    return torch.tensor((low, high), dtype=torch.float32).reshape(2, len(ACCURACY_KEYS), 3)

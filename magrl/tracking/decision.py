@@ -63,8 +63,8 @@ class ArrivalDecision(NamedTuple):
 
     @property
     def declare(self) -> Tensor:
-        """Whether to declare now."""
-        return self.probability >= self.worth
+        """Whether to declare now: never at a probability of 0, also where going on is worth nothing."""
+        return (self.probability >= self.worth) & (self.probability > 0)
 
 
 def arrival_decision(

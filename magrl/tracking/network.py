@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ FILE_FORMAT = 4
 """Format of the files of policies."""
 MOST_LAYERS = 64
 """Largest number of hidden layers."""
+LARGEST_WEIGHT = 1e6
+"""Largest size of a weight in a file."""
 _PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
 
 
@@ -89,6 +91,28 @@ def policy_content(path: Path | str) -> dict[str, Any]:
     return content
 
 
+def check_weights(weights: Mapping[str, Tensor]) -> None:
+    """Raise unless weights are real, finite, and at most :data:`LARGEST_WEIGHT` in size.
+
+    Example:
+        >>> check_weights({"bias": torch.zeros(2)})
+    """
+    check_finite(weights.items(), "weights")
+    for name, weight in weights.items():
+        if not weight.is_floating_point() or (weight.abs() > LARGEST_WEIGHT).any():
+            raise ValueError(f"{name} must hold real numbers of size up to {LARGEST_WEIGHT:g}, got {weight.dtype}")
+
+
+def check_entries(content: Mapping[str, Any], *names: str) -> None:
+    """Raise unless the content of the file of a policy has these entries and no other.
+
+    Example:
+        >>> check_entries({"rules": {}}, "rules")
+    """
+    if set(content) != set(names):
+        raise ValueError(f"its entries must be {sorted(names)}, got {short(sorted(content))}")
+
+
 def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
     """Read the rules and the network of :func:`save_pilot`. Reading a file runs no code from it.
 
@@ -103,14 +127,16 @@ def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
     """
     content = policy_content(path)
     try:
-        stated, cells, weights = (content.pop(name) for name in ("rules", "num_cells", "weights"))
+        entries = "rules", "num_cells", "weights"
+        check_entries(content, *entries)
+        stated, cells, weights = (content[name] for name in entries)
         if "max_turn_rad" in stated:  # of an older file
             stated["max_turn_deg"] = math.degrees(stated.pop("max_turn_rad"))
         rules = Rules(**stated)
         # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
         network = correction_network(cells, "meta")
         network.load_state_dict(weights, assign=True)
-        check_finite(weights.items(), "weights")
+        check_weights(weights)
     except Exception as error:  # whatever foreign content raises
         raise ValueError(f"{path} does not hold a valid pilot: {' '.join(str(error).split())}") from error
     return rules, network.float().requires_grad_(False).eval()

@@ -12,6 +12,7 @@ from magrl import GeomagneticNavEnv, ObservationView, Scenario
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.evaluation.navigators import training_settings
 from magrl.files import load_tensors, save_tensors
+from magrl.tracking.network import pretrained
 
 CELLS = (16, 16)
 
@@ -81,6 +82,30 @@ def test_damaged_policy_is_refused(policy, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message) as error:
             load_policy(path)
         assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["policy", "anywhere", "memory"])
+def test_files_of_all_kinds_hold_real_weights_of_one_policy(kind: str, policy, tmp_path: Path) -> None:
+    path, other = tmp_path / "policy.safetensors", {"memory": "rules"}.get(kind, "memory")
+    save_policy(path, policy if kind == "policy" else load_policy(pretrained(kind)))
+    content = load_tensors(path)
+    name = next(iter(content["weights"]))
+    for change, message in (
+        ({name: content["weights"][name] * 1e38}, f"{name} must hold real numbers of size up to 1e\\+06"),
+        (
+            {name: content["weights"][name].to(torch.complex64)},
+            f"{name} must hold real numbers .*, got torch.complex64",
+        ),
+        ({"more.weight": torch.zeros(1)}, "more.weight"),
+    ):
+        save_tensors(content | {"weights": content["weights"] | change}, path)
+        with pytest.raises(ValueError, match=message):
+            load_policy(path)
+    for entry in ({"more": 1}, {other: {}}):
+        save_tensors(content | entry, path)
+        with pytest.raises(ValueError, match="does not hold a valid") as error:
+            load_policy(path)
+        assert next(iter(entry)) in str(error.value)
 
 
 def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:

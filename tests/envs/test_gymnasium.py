@@ -313,14 +313,14 @@ def test_bad_calls() -> None:
     env.reset(seed=0, options={"task": 3})  # ignored, as in Gymnasium's environments
     for bad, message in (
         ((0, 0, 0), r"real numbers of shape \(1, 2\).*got int64 of shape \(1, 3\)"),
-        ((1.5, 0.0), r"of vehicles \[0\] are not finite or out of bounds: \[\[62.5, 0.0\]\]"),
+        ((1.5, 0.0), r"of vehicles \[0\] are not finite or out of bounds, \[\[1.5, 0.0\]\] in \[-1, 1\]: clip them"),
         ((0.1j, 0), "actions must be real numbers of .* got complex"),
     ):
         with pytest.raises(ValueError, match=message):
             env.step(np.array(bad))
     envs = make_vec(2, scale_actions=False)
     envs.reset(seed=0)
-    with pytest.raises(ValueError, match=r"of vehicles \[1\] .* out of bounds: \[\[51.0, 0.0\]\]"):
+    with pytest.raises(ValueError, match=r"of vehicles \[1\] .* out of bounds.* or \[\[51.0, 0.0\]\] as distance"):
         envs.step(np.array([[50.0, 0.0], [51.0, 0.0]]))
 
 

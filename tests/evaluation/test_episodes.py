@@ -20,6 +20,7 @@ from magrl import Anywhere, episode_measures, evaluate, evaluation_rollout, summ
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.envs.measures import path_efficiency, path_measures, spl
+from magrl.envs.navigation import navigation_env
 from magrl.evaluation.episodes import (
     bootstrap_interval,
     first_episode_mask,
@@ -111,6 +112,18 @@ def test_a_vehicle_without_a_finite_action_fails_alone() -> None:
     assert not episodes["success"][3]
     for key in ("success", "length_km", "steps"):
         assert torch.equal(episodes[key][others], sound[key][others]), key
+
+
+def test_a_vehicle_without_a_finite_action_stands_still_with_scaled_actions() -> None:
+    """There 0 is half a leg; it neither moves nor declares."""
+
+    def broken(tensordict: TensorDict) -> TensorDict:
+        action = torch.full_like(tensordict["heading"].expand(-1, 2), 0.5)
+        return tensordict.set("action", torch.where(tensordict["elapsed_steps"] > 0, math.nan, action))
+
+    with pytest.warns(UserWarning, match=r"vehicles \[0, 1\] stopped"):
+        rollout = evaluation_rollout(navigation_env(2, seed=0, max_steps=4), broken)
+    assert rollout["next", "move"][..., 0].tolist() == [[37.5, 0, 0, 0]] * 2
 
 
 TOLERANCES = {"heading_mae_deg": 0.2, "heading_rmse_deg": 0.1, "navigation_error_km": 0.1}

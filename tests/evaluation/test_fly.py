@@ -40,6 +40,18 @@ def test_the_pretrained_agent_arrives_and_declares_its_arrival(tmp_path: Path, m
     assert alone["outcome"] == "declared its arrival" + ("" if right else ", falsely")
 
 
+def test_a_flight_that_runs_out_of_steps_is_not_declared(tmp_path: Path) -> None:
+    """With the confidence of the option; an arrival signal has another outcome."""
+    config = recipe.Config("60.4N 5.3E", "60.4N 0.3E", navigator="kalman", max_steps=2, out=tmp_path)
+    result = recipe.fly(config)
+    assert (result["outcome"], result["without_signal"]["outcome"]) == ("reached the step limit", "not declared")
+    env = recipe.prepare(recipe.Config("60.4N 5.3E", "60.4N 0.3E", navigator="kalman", confidence=0.9))[
+        "without_signal"
+    ][0]
+    assert env.transform[-1].rules.confidence == 0.9
+    assert "km flown, " in recipe.summary(result)
+
+
 def test_wrong_settings(tmp_path: Path) -> None:
     options = {"start": "60.4N 5.3E", "destination": "60.2N 1.1W", "navigator": "secant", "out": tmp_path / "out"}
     for change, message in (
@@ -52,3 +64,19 @@ def test_wrong_settings(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match=message):
             recipe.prepare(recipe.Config(**(options | change)))
     assert not (tmp_path / "out").exists()
+
+
+def test_the_distance_left_is_beside_the_path() -> None:
+    """A flight that ends before the destination is shorter than the shortest path to it."""
+    ends = {"start_position": [60.0, 5.0], "target_position": [60.0, 11.0], "target_field": [1.0, 70.0, 15000.0]}
+    result = {
+        **ends,
+        "errors": "ship",
+        "outcome": "arrived",
+        "navigator": "kalman",
+        "needs": "nothing",
+        "north": "true",
+    }
+    result |= {"steps": 9, "max_steps": 50, "length_km": 343.2, "shortest_km": 354.4, "navigation_error_km": 23.6}
+    result |= {"path_efficiency": 0.966, "without_signal": result | {"ellipse": "here"}}
+    assert "path            343 km flown, 23.6 km left of 354\n" in recipe.summary(result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from magrl import load_policy, save_policy, score
 from magrl.agents.onnx_policy import with_description
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.navigation import NAMED_ENVS, navigation_env
-from magrl.evaluation.scores import SEED, scored
+from magrl.evaluation.scores import SEED, flown, scored
 from magrl.navigators import Secant
 from magrl.registry import NAMED_TASKS
 
@@ -102,6 +103,48 @@ def test_a_state_is_passed_to_every_function_that_has_one() -> None:
     assert score(scaled, **BOX) == score(toward, **BOX)
 
 
+class Unfit(nn.Module):
+    """Normalizes, drops out, and writes a value for one vehicle from its third call on."""
+
+    def __init__(self, value: float = 0.0) -> None:
+        super().__init__()
+        self.norm, self.drop, self.calls, self.value = nn.BatchNorm1d(13), nn.Dropout(), 0, value
+
+    def forward(self, observation: Tensor) -> Tensor:
+        action = self.drop(self.norm(observation))[:, :2].tanh().double()
+        self.calls += 1
+        action[3, 0] = self.value if self.calls > 2 else 0.0
+        return action
+
+
+def test_modules_fly_in_eval_mode_and_keep_theirs() -> None:
+    """Also where an evaluation fails: without dropout, with the statistics of the training."""
+    module = Unfit()
+    module.drop.eval()
+    before = copy.deepcopy(module.state_dict())
+    scores = [score(module, **BOX) for _ in range(2)]
+    assert scores[0] == pytest.approx(scores[1], nan_ok=True)
+    assert score(Unfit().eval(), **BOX) == pytest.approx(scores[0], nan_ok=True)
+    module.value = math.nan
+    with pytest.raises(ValueError, match="is not finite"):
+        score(module, **BOX)
+    assert [part.training for part in module.modules()] == [True, True, False]
+    assert all(torch.equal(value, before[key]) for key, value in module.state_dict().items())
+
+
+def test_an_action_that_is_not_finite_in_float32_is_refused_with_vehicle_and_step() -> None:
+    for value in (math.nan, -math.inf, 1e300):
+        message = r"the agent's action is not finite: vehicles \[3\] at step 2 \(the first is step 0\)"
+        with pytest.raises(ValueError, match=message):
+            score(Unfit(value), **BOX)
+    with pytest.raises(ValueError, match="actions must be finite numbers"):
+        score(lambda observations: 0 * observations[:, :2].astype(float) + 1e300, **BOX)
+
+
+def test_a_score_is_of_1000_episodes() -> None:
+    assert flown(lambda seen: 0 * seen[:, :2], "box", max_steps=1).shape == (1000, 1)
+
+
 def test_what_is_no_agent_or_no_evaluation_is_refused() -> None:
     for agent, options, message in (
         (lambda *seen: seen[0], {}, r"act\(observations\) or act\(observations, state\), got .*: name its arguments"),
@@ -175,7 +218,12 @@ def test_what_is_wrong_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         (SimpleNamespace(), "box", {}, "agent must be"),
         (lambda observations: observations, "box", {}, r"actions must be finite numbers of shape \(2, 2\)"),
         (lambda observations: np.nan * observations[:, :2], "box", {}, "actions must be finite"),
-        (lambda observations: 0 * observations[:, :2] + 3, "box", {}, "out of bounds"),
+        (
+            lambda observations: 0 * observations[:, :2] + 3,
+            "box",
+            {},
+            r"vehicles \[0, 1\] .* \[3.0, 3.0\]\] in \[-1, 1\]: clip them",
+        ),
         (toward, "box", {"observation": "dict"}, "observation='dict' leaves out"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):

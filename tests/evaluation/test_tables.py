@@ -58,11 +58,14 @@ def test_papers_row_stands_above_the_algorithm() -> None:
     assert [cells(line)[0] for line in lines[2:4]] == ["GA, paper", "GA, look-ahead (an oracle)"]
 
 
-def test_short_table_has_eight_columns_and_no_row_of_the_paper() -> None:
-    """False arrivals are shown where vehicles declare their arrival."""
+def test_short_table_has_nine_columns_and_no_row_of_the_paper() -> None:
+    """False arrivals, and what ran out of steps, are shown where vehicles declare their arrival."""
     runs = {"success_rate": 90.0, "spl": 80.0, "steps": 9.0, "navigation_error_km": 8.0}
-    lines = short_table({"ga": [runs] * 2, "kalman": [runs | {"false_arrival_rate": 1.5}]}).splitlines()
-    assert cells(lines[0]) == ["navigator", "given", "runs", "SR %", "SPL %", "TNT steps", "NE km", "false arrivals %"]
+    lines = short_table(
+        {"ga": [runs] * 2, "kalman": [runs | {"false_arrival_rate": 1.5, "not_declared_rate": 2.0}]}
+    ).splitlines()
+    declared = ["false arrivals %", "not declared %"]
+    assert cells(lines[0]) == ["navigator", "given", "runs", "SR %", "SPL %", "TNT steps", "NE km", *declared]
     assert cells(lines[2])[2:5] == ["2", "90.0 [90.0–90.0]", "80.00 [80.00–80.00]"]
-    assert [cells(line)[-1] for line in lines[2:]] == ["—", "1.5"]
+    assert [cells(line)[-2:] for line in lines[2:]] == [["—", "—"], ["1.5", "2.0"]]
     assert "paper" not in comparison_table({"ga": [runs]}, published=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import ppo_memory as recipe
 import pytest
 import torch
@@ -11,10 +13,11 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs.utils import check_env_specs
 
 from magrl import load_policy, planet_scenario, save_policy
+from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import policy_env
 from magrl.navigators.memory import Memory, MemoryNetwork
 from magrl.tracking.network import pretrained
-from magrl.transforms.sequences import READING_SIZE
+from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE
 
 CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=8)
 
@@ -89,8 +92,46 @@ def test_a_training_writes_its_agent(tmp_path) -> None:
     recipe.train(small(recipe, tmp_path / "run", task="readings", **sizes))
     saved = load_policy(tmp_path / "run" / "policy.safetensors")
     assert isinstance(saved, Memory)
+    assert (saved.accuracy[0] <= saved.accuracy[1]).all()
+    assert saved.accuracy[1].isfinite().all()
     for part in (saved.network.correct, saved.network.estimate):
         assert all(weight.any() for weight in part[-1].parameters())
+
+
+def test_it_takes_an_accuracy_as_the_nearest_one_of_its_training(tmp_path) -> None:
+    """Of Storm, the only one; the range is in its file, and a training writes it."""
+    saved, ends = network(), [[0.05, 0.05, 5.0, 0.0, 0.0, 0.0]] * 2
+    Memory(saved, ends).save(tmp_path / "memory.safetensors")
+    fits, free = Memory(tmp_path / "memory.safetensors"), Memory(saved)
+    env = policy_env(GeomagneticNavEnv(num_envs=4, seed=0), fits)
+    state = env.reset()
+    for key, std in zip(ACCURACY_KEYS, ([0.05, 0.05, 5.0], [0.0] * 3), strict=True):
+        state[key] = torch.tensor(std).expand(4, 3)
+    hidden = "next", "memory", "hidden"
+    wanted = free(state.clone())[hidden]
+    state["sensor_std"], state["bias_std"] = torch.rand(4, 3), 9 * torch.ones(4, 3)
+    assert torch.equal(fits(state.clone())[hidden], wanted)
+    assert not torch.equal(free(state)[hidden], wanted)
+    assert recipe.accuracy_range(training_env().reset()) == [pytest.approx(end) for end in ends]
+    assert Memory().accuracy.flatten(1).tolist() == [pytest.approx(end) for end in ends]
+    for wrong in ([[0.0] * 6, [0.0] * 5], [[1.0] * 6, [0.0] * 6], [[-1.0] * 6, [0.0] * 6], [[0.0] * 6, [math.nan] * 6]):
+        with pytest.raises(ValueError, match="accuracy must be"):
+            Memory(saved, wrong)
+
+
+def test_it_flies_where_the_default_is_float64() -> None:
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    flown = policy_env(env, Memory()).rollout(2, Memory())["action"]
+    torch.set_default_dtype(torch.float64)
+    try:
+        again = GeomagneticNavEnv(num_envs=2, seed=0)
+        for memory in (Memory(), Memory(network())):
+            action = policy_env(again, memory).rollout(2, memory)["action"]
+        again.set_seed(0)
+        torch.testing.assert_close(policy_env(again, Memory()).rollout(2, Memory())["action"], flown)
+        assert action.dtype == torch.float32
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_a_file_of_an_agent_holds_its_network_and_no_other(tmp_path) -> None:

@@ -74,6 +74,13 @@ def test_fewer_steps_are_worth_less_and_without_any_it_declares() -> None:
     assert (attainable.diff() > 0).all()
 
 
+def test_a_place_that_is_not_possible_here_is_never_declared() -> None:
+    """Also without steps left, where going on is worth nothing."""
+    decided = decide(400.0, 1e-3, 0.0, left=0, places=f64((400.0, 0.0)))[0]
+    assert (decided.probability, decided.worth) == (0, 0)
+    assert not decided.declare.item()
+
+
 def test_tails_of_the_posterior_and_the_price_on_a_detour_by_hand() -> None:
     """Three of five places are 5 km ahead, and a reading there would be exact: (1 + 3/5) / 2 is attainable.
 

@@ -125,7 +125,7 @@ def test_declarations_are_as_often_right_as_they_say_and_confidence_prevents_fal
         assert confidence or abs(probability.mean() - right.float().mean()) < 0.12
         rates.append(summarize(episode_measures(rollout)))
     bold, careful = rates
-    assert bold["success_rate"] + bold["false_arrival_rate"] == 100
+    assert bold["success_rate"] + bold["false_arrival_rate"] + bold["not_declared_rate"] == 100
     assert 0 < careful["false_arrival_rate"] < bold["false_arrival_rate"] - 5
     assert 10 < careful["success_rate"] < bold["success_rate"]
 
@@ -142,13 +142,14 @@ def test_measures_by_hand() -> None:
     episodes = episode_measures(evaluation_rollout(env, policy))
     assert episodes["success"].tolist() == [True, True, False, False]
     assert episodes["false_arrival"].tolist() == [False, False, True, False]
+    assert episodes["not_declared"].tolist() == [False, False, False, True]
     summary = summarize(episodes)
     assert summary["success_rate"] == 50
-    assert summary["false_arrival_rate"] == 25
+    assert summary["false_arrival_rate"] == summary["not_declared_rate"] == 25
     assert summary["false_arrival_rate_low"] == pytest.approx(4.56, abs=0.01)
     assert summary["navigation_error_km"] == pytest.approx(7.0, abs=1e-4)
     plain = episode_measures(evaluation_rollout(paper_env(), Secant()))
-    assert "false_arrival" not in plain
+    assert not {"false_arrival", "not_declared"} & set(plain)
     assert "false_arrival_rate" not in summarize(plain)
 
 

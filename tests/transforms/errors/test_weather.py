@@ -151,6 +151,16 @@ def test_mistakes(says: str) -> None:
 # Surrogates
 
 
+def test_surrogates_do_not_depend_on_the_default_dtype() -> None:
+    record = weather_record("college")
+    drawn = record.surrogates(2)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(record.surrogates(2), drawn)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_surrogates_have_the_spectra_of_the_record_and_other_phases() -> None:
     """Of each component and of their products; an odd length has no highest frequency that is real."""
     for variation in (weather_record("college").variation, weather_record("college").variation[:-1]):
