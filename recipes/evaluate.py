@@ -85,6 +85,8 @@ class Config(ScenarioOptions):
     """Model of the Earth that vehicles carry, of the date: IGRF-14, IGRF-13, IGRF-2005, ...; none by default."""
     start_km: float | None = None
     """Error of the start as vehicles know it, with a model [km]; by default they do not know their start."""
+    target_std: Noise = (0.0, 0.0, 0.0)
+    """Errors of D [deg], I [deg], B_H [nT] at the destination (standard deviations); exact by default."""
     confidence: float = 0.5
     """Minimum estimated probability at which vehicles declare, with --arrival declared."""
     seed: int = 0
@@ -150,7 +152,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         config, notes = with_training_settings(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        told = ("errors", "north", "model", "start_km", "confidence", "seed", "device")
+        told = ("errors", "north", "model", "start_km", "target_std", "confidence", "seed", "device")
         flights = [Flight(tasks, **{key: getattr(config, key) for key in told}) for tasks in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         check_writable(create_run_folder(config.out) / "summary.json")
@@ -203,7 +205,7 @@ def settings(config: Config, flight: Flight) -> dict[str, Any]:
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
         "north": north(flight),
-        **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "confidence", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "target_std", "confidence", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **env.scenario.model_dump(include={*RULES, "altitude_km"}),
     }
@@ -225,6 +227,7 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
         "Conditions": isinstance(config.errors, str) and config.errors,
         "Model of the Earth": config.model or "",
         "Error of the known start": "" if config.start_km is None else f"{config.start_km:g} km",
+        "Errors of the elements at the destination": any(config.target_std) and text(*config.target_std),
         "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
     }
     told = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)

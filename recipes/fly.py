@@ -68,6 +68,8 @@ class Config:
     """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
     start_km: float | None = None
     """Error of the start as the vehicle knows it, with a model [km]; by default it does not know its start."""
+    target_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Errors of D [deg], I [deg], B_H [nT] at the destination (standard deviations); exact by default."""
     confidence: float = 0.5
     """Minimum estimated probability at which the vehicle declares its arrival."""
     date: str = "2025-01-01"
@@ -153,6 +155,7 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
                 north=config.north,
                 model=config.model,
                 start_km=config.start_km,
+                target_std=config.target_std,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
@@ -179,6 +182,12 @@ def rollout(env: EnvBase, navigator: Watched, start_heading: float | Literal["ra
             state["heading"] = wanted
     with torch.no_grad(), navigator.bar:
         return env.rollout(env.max_steps, navigator, auto_reset=False, tensordict=state)
+
+
+def true_target(first: TensorDictBase) -> list[float]:
+    """Return the true elements of the destination, which a compass or an error of them may hide."""
+    keys = ("true_target_field", "exact_target_field", "target_field")
+    return next(first[key].tolist() for key in keys if key in first)
 
 
 def outcome(steps: TensorDictBase) -> str:
@@ -231,7 +240,7 @@ def fly(config: Config) -> dict[str, Any]:
         "needs": kind.needs,
         **{key: getattr(base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position")},
-        "target_field": first.get("true_target_field", first["target_field"]).tolist(),
+        "target_field": true_target(first),
         **measures["with_signal"],
         "without_signal": measures["without_signal"] | {"ellipse": Way(**last["track", "way"]).ellipse()},
     }

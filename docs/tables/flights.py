@@ -6,18 +6,19 @@ import glob
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from magrl.benchmark import TRACKS, Track
+from magrl.envs import Tasks
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import named
 from magrl.evaluation.tables import about, mean_of_runs
 from magrl.files import check_writable, write_with
 from magrl.geodesy import geodesic, move_place, polar
-from magrl.sensor_std import Noise
+from magrl.sensor_std import PERFECT, Noise
 from magrl.transforms import Conditions
 
 import torch
@@ -31,6 +32,12 @@ Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 MEASURES = ("success_rate", "spl")
 """Measures in a cell of a table."""
+SHARES = {"success_rate": "success", "false_arrival_rate": "false_arrival"}
+"""Measures that are shares of episodes, and what they count."""
+PLACED = ("geodesic",)
+"""Navigators that read no elements."""
+ABOUT = ("navigator", "trained on", "start", "map", "elements at the destination")
+"""First columns of a table: what each navigator is, and what it knows."""
 OWN_OPTIONS = ("north", "confidence", "model", "start_km", "target_std")
 """Options of flights that a navigator may have by itself."""
 OWN_MODEL = "model"
@@ -44,8 +51,16 @@ class Table(NamedTuple):
     episodes: list[DataFrame]
 
 
+@dataclass(frozen=True)
 class Flights(Track):
     """A track that navigators of tables fly."""
+
+    target_std: Sequence[float] = PERFECT.noise
+    """Standard deviations of the errors of D [deg], I [deg], B_H [nT] at the destination."""
+
+    def flight(self, errors: Errors, tasks: Tasks | None = None, **changes: Any) -> Flight:
+        """Return vehicles with some errors, as a track does."""
+        return super().flight(errors, tasks, **{"target_std": self.target_std} | changes)
 
     @classmethod
     def of(cls, track: str | None = None, **options: Any) -> Flights:
@@ -166,28 +181,55 @@ def runs_of(navigator: Spec) -> list[Spec]:
     return [f"{label}{equals}{run}" for run in matching(pattern)] if "*" in pattern else [navigator]
 
 
-def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
-    """Return measures of the episodes of one or several runs; of several, the SPL has an interval."""
+def cell(runs: Sequence[Measures], measures: Sequence[str], region: Tensor | None = None) -> str:
+    """Return measures of the episodes of one or several runs; of several, the SPL has an interval.
+
+    With the region of each episode, measures of one run that are shares of them have an interval, clustered by region.
+    """
     summaries = [summarize(episodes) for episodes in runs]
     if len(summaries) == 1:
-        return " / ".join("—" if math.isnan(summaries[0][name]) else f"{summaries[0][name]:.1f}" for name in measures)
+        return " / ".join(shown(summaries[0][name], runs[0].get(SHARES.get(name, "")), region) for name in measures)
     return " / ".join(
         mean_of_runs([run[name] for run in summaries], form=".1f", interval=name == "spl") for name in measures
     )
 
 
-def names(navigator: Spec) -> list[str]:
-    """Return the label of a navigator, with its options, what it was trained on, and what it is given.
+def shown(value: float, share: Tensor | None, region: Tensor | None) -> str:
+    """Return a value as text; of a share ``(N,)`` of episodes in regions, with the half-width of its interval."""
+    if share is None or region is None:
+        return "—" if math.isnan(value) else f"{value:.1f}"
+    return f"{value:.1f} ± {clustered(100 * share.double().flatten(), region)[1]:.1f}"
 
-    What a vehicle knows of the Earth, its start and its destination is what it is given. Elements of its own model
-    tell it nothing of its destination.
+
+def names(navigator: Spec, target_std: Sequence[float] = PERFECT.noise) -> list[str]:
+    """Return the label of a navigator, with its options, what it was trained on, and what it knows: :data:`ABOUT`.
+
+    A navigator without a model of the Earth has what it needs instead. Elements of its own model tell it nothing of its
+    destination.
+
+    Args:
+        navigator: navigator with its options.
+        target_std: accuracy of the elements at the destination, unless it has another.
     """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    text, trained, given = about(named(runs_of(options.pop("name"))[0]).kind)
-    model, start_km, target_std = (options.pop(key, None) for key in ("model", "start_km", "target_std"))
-    told = [] if model is None else [model]
-    if start_km is not None:
-        told.append(f"start ± {start_km:g} km")
-        told += [] if target_std == OWN_MODEL else ["elements measured at the destination"]
-    label = ", ".join([text, *(f"{key.replace('_', ' ')} {value}" for key, value in options.items())])
-    return [label, trained, (", " if len(told) > 2 else " and ").join(told) or given]
+    kind = named(runs_of(options.pop("name"))[0]).kind
+    text, trained, needs = about(kind)
+    start_km, std = options.pop("start_km", None), options.pop("target_std", target_std)
+    known = ["no" if start_km is None else f"± {start_km:g} km", options.pop("model", needs)]
+    known.append("no" if std == OWN_MODEL else "± {:g}°, {:g}°, {:g} nT".format(*std) if any(std) else "exact")
+    label = ", ".join([text, *(label_of(*option) for option in options.items())])
+    return [label, trained, *(["—", needs, "—"] if kind.name in PLACED else known)]
+
+
+def label_of(option: str, value: Any) -> str:
+    """Return an option of a navigator as text."""
+    if option == "confidence":
+        return f"declares at {value:g}" if value else "declares at once"
+    return f"{option.replace('_', ' ')} {value}"
+
+
+def titles_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the first cell of each row, with what the navigator knows where others have the same."""
+    labels = [row[0] for row in rows]
+    known = ["; ".join(f"{head}: {cell}" for head, cell in zip(heads[2:], row[2:], strict=False)) for row in rows]
+    return [f"{one} ({it})" if labels.count(one) > 1 else one for one, it in zip(labels, known, strict=True)]

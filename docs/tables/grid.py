@@ -24,7 +24,7 @@ from typing import Any
 
 from magrl.benchmark import COLUMNS, episode_table, write_episodes
 from magrl.evaluation.navigators import check_distinct
-from magrl.evaluation.tables import ABOUT, markdown_table
+from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, read_document, read_text, write_text
 from magrl.training import UsageError, command
 
@@ -34,7 +34,7 @@ from pandas import read_csv
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
-from flights import MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of
+from flights import ABOUT, MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of, titles_of
 
 from evaluate import Config, evaluate
 
@@ -45,7 +45,7 @@ FILE, RUNS = Path(__file__).parent / "tables.toml", Path("runs")
 def flights(
     navigators: Sequence[Spec],
     *,
-    against: Sequence[Spec] = (),
+    against: Sequence[Sequence[int]] = (),
     measures: Sequence[str] = MEASURES,
     jobs: int = 1,
     device: str = "cpu",
@@ -53,33 +53,27 @@ def flights(
 ) -> Table:
     """Return a row for each navigator, and a column for each level of noise, or each of some conditions.
 
-    A cell has the ``measures``. The last rows are differences between the first navigator and those that it is compared
-    ``against``, of SPL where cells have it, of correct arrivals otherwise. The other options are those of
-    :meth:`Flights.of`.
+    A cell has the ``measures``; arrivals of vehicles that declare have intervals, clustered by region. The last rows
+    are differences between two navigators, whose numbers from 0 on are a pair of ``against``: of SPL where cells have
+    it, of correct arrivals otherwise. The other options are those of :meth:`Flights.of`.
     """
     made, rows, shares, tables = Flights.of(**options), [], {}, []
     share, measure = ("spl", "SPL") if "spl" in measures else ("success", "correct arrivals")
     region = made.scenario.tasks.region
-    labels = [names(navigator)[0] for navigator in navigators]
-
-    def title(navigator: Spec) -> str:
-        """Return the label of a navigator, with what it is given where others have the same."""
-        label, _, given = names(navigator)
-        return f"{label} ({given})" if labels.count(label) > 1 else label
-
+    known = [names(navigator, made.target_std) for navigator in navigators]
+    titles = titles_of(ABOUT, known)
     cells = mapped(partial(episodes_of, options, device), list(itertools.product(navigators, made.errors)), jobs)
-    for navigator in navigators:
-        name = title(navigator)
+    for name, about_it in zip(titles, known, strict=True):
         episodes = {level: next(cells) for level in made.errors}
         shares[name] = [runs[0][share].double() for runs in episodes.values()]
-        rows.append([*names(navigator), *(cell(runs, measures) for runs in episodes.values())])
+        clusters = region if "false_arrival_rate" in measures else None
+        rows.append([*about_it, *(cell(runs, measures, clusters) for runs in episodes.values())])
         for level, runs in episodes.items():
             about = {"navigator": name, "level": level, "seed": made.seed}
             tables += [episode_table(run, region, run=number, **about) for number, run in enumerate(runs)]
-    first = title(navigators[0])
-    for other in [name for name in map(title, against) if name in shares]:
+    for first, other in ([titles[row] for row in pair] for pair in against if max(pair) < len(titles)):
         differences = (paired_difference(*pair, region) for pair in zip(shares[first], shares[other], strict=True))
-        rows.append([f"{first} − {other}, {measure}", "—", "—", *differences])
+        rows.append([f"{first} − {other}, {measure}", *["—"] * (len(ABOUT) - 1), *differences])
     return Table(markdown_table([*ABOUT, *made.errors], rows), tables)
 
 
@@ -159,7 +153,7 @@ def make(
             continue
         check_writable(out / f"{name}.md")
         write_text(out / f"{name}.md", made.text.rstrip() + "\n")
-        track = specs[name].get("track", name)
+        track = name if "target_std" in specs[name] else specs[name].get("track", name)
         write_episodes(out / f"{name}.csv.gz", [episodes.assign(track=track) for episodes in made.episodes])
 
 

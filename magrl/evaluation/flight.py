@@ -19,7 +19,7 @@ from magrl.navigators import Navigator, policy_env
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import Rules, earth_model
 from magrl.tracking.earth import EarthModel
-from magrl.transforms import Conditions, KnownPlace, TrackField, conditions_named, with_conditions
+from magrl.transforms import Conditions, KnownPlace, TargetErrors, TrackField, conditions_named, with_conditions
 from magrl.transforms.errors.north import MAGNETIC
 from magrl.transforms.track import known_keys
 
@@ -43,8 +43,9 @@ class Flight:
             the paper.
         start_km: root mean square error of the place where they start [km]; None where they do not know it.
         target_km: the same of the destination, where they know the start.
-        target_std: standard deviations of D [deg], I [deg], B_H [nT] with which the elements of the destination are
-            measured, where they know the start; None where these are from their own model.
+        target_std: standard deviations of D [deg], I [deg], B_H [nT] of the elements at the destination, which have
+            such errors (:class:`magrl.transforms.TargetErrors`) and state them; None for vehicles that know the start
+            and take the elements from their own model.
         rules: further values of :class:`magrl.tracking.Rules`, such as ``step_price``.
         confidence: minimum probability at which navigators declare an arrival, with arrival ``"declared"``.
         num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
@@ -104,6 +105,10 @@ class Flight:
         self.sensor_std = errors.std
         if model is not None:
             self.rules["model"] = earth_model(model, scenario.date, scenario.altitude_km)
+        if target_std is not None and any(target_std):
+            self.rules["target_std"] = target_std
+            drawn = (0.0 if errors.std.magnetic else target_std[0], *target_std[1:])  # by a compass, D is 0 everywhere
+            self.env = TransformedEnv(self.env, TargetErrors(drawn, seed=seed), auto_unwrap=True)
         if start_km is not None:
             told = {"start_km": start_km, "target_km": target_km, "target_std": target_std}
             told |= dict(zip(("drift", "wander_km"), errors.motion_std, strict=True))

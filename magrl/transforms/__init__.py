@@ -25,6 +25,7 @@ from magrl.transforms.errors.north import north_reference as north_reference
 from magrl.transforms.errors.sensors import SensorErrors as SensorErrors
 from magrl.transforms.errors.sensors import sensor_levels as sensor_levels
 from magrl.transforms.errors.spikes import Spikes as Spikes
+from magrl.transforms.errors.target import TargetErrors as TargetErrors
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
 from magrl.transforms.rewards import DistanceCost as DistanceCost

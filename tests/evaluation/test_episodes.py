@@ -21,6 +21,7 @@ from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.envs.measures import path_efficiency, path_measures, spl
 from magrl.envs.navigation import navigation_env
+from magrl.evaluation import Flight
 from magrl.evaluation.episodes import (
     bootstrap_interval,
     first_episode_mask,
@@ -45,6 +46,19 @@ def test_every_task_is_flown_once_with_errors_of_its_own() -> None:
     perfect = evaluate("secant", thrice, max_steps=5)
     torch.testing.assert_close(perfect["length_km"], perfect["length_km"][:1].expand(3))
     assert (evaluate("secant", thrice, errors="ship", max_steps=5)["steps"] <= 5).all()
+
+
+@pytest.mark.parametrize("known", [{}, {"model": "IGRF-13", "start_km": 5.0}])
+def test_elements_at_the_destination_have_the_errors_that_vehicles_state(known: dict) -> None:
+    """Whether they know the start or not; without D, that of D is none, and exact elements are as without errors."""
+    std, tasks = (0.1, 0.05, 30.0), named_tasks("paper-100")
+    for north, signs in (("true", [1, 1, 1]), ("magnetic", [0, 1, 1])):
+        flight = Flight(Scenario().with_tasks(tasks), north=north, target_std=std, **known)
+        error = flight.env.reset()["target_error"]
+        assert error.std(0) == pytest.approx(torch.tensor(std) * torch.tensor(signs), rel=0.25)
+        assert flight.navigator("kalman").rules.target_std == std
+    for none in ((0.0, 0.0, 0.0), None):
+        assert "target_error" not in Flight(Scenario().with_tasks(tasks), target_std=none, **known).env.reset()
 
 
 def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:

@@ -13,6 +13,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.training import UsageError
 
 NOISE = (0.05, 0.05, 5.0)
+TARGET = ("--target-std", "0.01", "0.02", "3")
 
 
 def make_run(folder: Path, env: GeomagneticNavEnv, **settings: object) -> Path:
@@ -34,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
-    evaluate.main([f"{run}", "secant", "pso", "--tasks", "4", "--max-steps", "3", "--out", str(out)])
+    evaluate.main([f"{run}", "secant", "pso", "--tasks", "4", "--max-steps", "3", "--out", str(out), *TARGET])
     return out
 
 
@@ -61,6 +62,7 @@ def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
     assert first[:3] == ["Gradient-Guided TD3, trained with noise", "the region", "nothing"]
     assert [published[0], *published[4:8]] == ["PSO, paper", "29.0", "442495", "27.09", "21.03"]
     assert "Standard deviations of the noise on D, I and B_H: 0.05 deg, 0.05 deg, 5 nT." in lines
+    assert "Errors of the elements at the destination: 0.01 deg, 0.02 deg, 3 nT." in lines
     assert (results / "trajectories.png").stat().st_size > 10_000
 
 
@@ -75,6 +77,7 @@ def test_paths_and_settings_state_what_was_flown(results: Path) -> None:
     settings = json.loads((results / "settings.json").read_text(encoding="utf-8"))
     assert settings["navigators"] == ["gg_td3_noise=noisy", "secant", "pso"]
     expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
+    expected |= {"target_std": [0.01, 0.02, 3.0]}
     assert settings.items() >= expected.items()
 
 

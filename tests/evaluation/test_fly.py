@@ -6,17 +6,22 @@ from pathlib import Path
 
 import fly as recipe
 import pytest
+import torch
 from matplotlib.figure import Figure
 
+from magrl.field import IGRF, elements_at
 from magrl.training import UsageError
 
 
 def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
     options = ("--navigator", "secant", "--out", str(tmp_path), "--start-heading", "270", "--max-steps", "7")
-    recipe.main(["-33.9 18.4", "-33.8, 18.6", *options])
+    recipe.main(["-33.9 18.4", "-33.8, 18.6", *options, "--target-std", "0.001", "0.001", "0.1"])
     assert "outcome         arrived\n" in capsys.readouterr().out
     result = json.loads((tmp_path / "flight.json").read_text(encoding="utf-8"))
     assert result["start_position"] == pytest.approx([-33.9, 18.4])
+    true = elements_at(IGRF("2025-01-01"), torch.tensor([-33.8, 18.6], dtype=torch.float64)).tolist()
+    assert result["target_field"] == pytest.approx(true, rel=1e-6)
+    assert result["target_std"] == [0.001, 0.001, 0.1]
     assert (result["zeta"], result["needs"]) == (0.01, "nothing")
     assert result["shortest_km"] <= result["length_km"] * 1.1 < 400
     assert result["navigation_error_km"] < 30

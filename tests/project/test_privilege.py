@@ -20,7 +20,7 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS
 from magrl.sensor_std import STD_KEYS
 from magrl.tracking import Rules
-from magrl.transforms import CONDITIONS, TRUE_KEYS, MagneticNorth, ReadingView, TrackField
+from magrl.transforms import CONDITIONS, TRUE_KEYS, MagneticNorth, ReadingView, TargetErrors, TrackField
 from magrl.transforms.errors.base import EPISODE_STREAM
 
 ORACLES = {"parallel", "geodesic", "ga", "pso", "afsa"}
@@ -29,6 +29,7 @@ PLACES = {"dead_reckoning": ("start_position", "target_position")}
 CONDITION = CONDITIONS["low-cost"]
 PRIVATE = {*PRIVILEGED_KEYS, *TRUE_KEYS}
 COMPASS = {"compass_declination", "compass_stream", "true_target_field"}
+TARGET = TargetErrors((0.1, 0.05, 30.0))
 TOLD = ["sensor_std", "bias_std", "drift_std"]
 PUBLIC = {*PUBLIC_KEYS, *STD_KEYS, "elapsed_steps", "done", "terminated", "truncated"}
 
@@ -40,7 +41,7 @@ def base_env(seed: int = 5) -> GeomagneticNavEnv:
 def erring_env(magnetic: bool = False) -> TransformedEnv:
     """The environment with every error; a vehicle has one north."""
     *errors, north = every_error()
-    return TransformedEnv(base_env(), Compose(*errors, MagneticNorth() if magnetic else north))
+    return TransformedEnv(base_env(), Compose(*errors, MagneticNorth() if magnetic else north, TARGET.clone()))
 
 
 @pytest.fixture(scope="module", params=["true", "magnetic"])

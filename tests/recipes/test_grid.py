@@ -92,51 +92,63 @@ NEAR = {"tasks": 4, "distance_km": (100, 150), "max_steps": 4}
 
 def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
     oracle, old = "geodesic", {"name": "kalman", "step_price": 30.0}
-    table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], **NEAR).text)
-    assert table[0] == ["navigator", "trained on", "given", "0, 0, 0", "0.5, 0.1, 20"]
-    assert table[2][3] == "100.0 / 100.0"
+    table = rows(grid.flights([oracle, old], against=[(0, 1), (0, 2)], levels=[(0, 0, 0), (0.5, 0.1, 20)], **NEAR).text)
+    assert table[0] == [*flights.ABOUT, "0, 0, 0", "0.5, 0.1, 20"]
+    assert len(table) == 5  # a pair of a navigator that is not flown is left out
+    assert table[2][5] == "100.0 / 100.0"
     assert table[3][0] == "Kalman (dual control), step price 30.0"
     assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
-    assert table[4][3].strip("*").startswith("+")
+    assert table[4][5].strip("*").startswith("+")
     options = {"levels": [(0, 0, 0)], "tasks": 2}
-    assert rows(grid.flights([oracle], **options, max_steps=1).text)[2][3] == "0.0 / 0.0"
+    assert rows(grid.flights([oracle], **options, max_steps=1).text)[2][5] == "0.0 / 0.0"
     far = rows(grid.flights([oracle], **options, distance_km=(1200, 1300), max_steps=30).text)
-    assert far[2][3] == "100.0 / 100.0"
+    assert far[2][5] == "100.0 / 100.0"
 
 
 def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, monkeypatch) -> None:
     few = replace(benchmark.TRACKS["vehicles-v3"], **NEAR, conditions=["ship"])
     monkeypatch.setitem(benchmark.TRACKS, "vehicles-v3", few)
-    for confidence, ends in ((0.0, "100.0 / 0.0"), (1.0, "0.0 / 0.0")):
+    for confidence, ends in ((0.0, "100.0 ± 0.0 / 0.0 ± 0.0"), (1.0, "0.0 ± 0.0 / 0.0 ± 0.0")):
         grid.make(("confidence",), navigators=("geodesic",), tasks=2, confidence=confidence, out=tmp_path / "new")
         head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
-        assert head == ["navigator", "trained on", "given", "ship"]
-        assert row[3] == ends
+        assert head == [*flights.ABOUT, "ship"]
+        assert row[5] == ends
+        assert set(read_episodes(tmp_path / "new" / "confidence.csv.gz")["track"]) == {"confidence"}
 
 
-def test_a_column_says_whether_the_destination_was_measured(monkeypatch) -> None:
+def test_columns_say_what_a_navigator_knows(monkeypatch) -> None:
     """Elements of the vehicle's own model tell it nothing of its destination, and do not count as measured."""
-    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights(tasks=2, max_steps=2)
+    std = (0.1, 0.05, 30.0)
+    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights(tasks=2, max_steps=2, target_std=std)
     measured, own = {"name": "secant", **told}, {"name": "secant", **told, "target_std": flights.OWN_MODEL}
-    given = [flights.names(spec)[2] for spec in (measured, own, {"name": "kalman", "model": "IGRF-13"}, "kalman")]
-    assert given == [
-        "IGRF-13, start ± 5 km, elements measured at the destination",
-        "IGRF-13 and start ± 5 km",
-        "IGRF-13",
-        "the field's spectrum",
+    exact, mine = measured | {"target_std": [0, 0, 0]}, {"name": "kalman", "model": "IGRF-13"}
+    assert [flights.names(spec, std)[2:] for spec in (measured, own, exact, mine, "kalman", "geodesic")] == [
+        ["± 5 km", "IGRF-13", "± 0.1°, 0.05°, 30 nT"],
+        ["± 5 km", "IGRF-13", "no"],
+        ["± 5 km", "IGRF-13", "exact"],
+        ["no", "IGRF-13", "± 0.1°, 0.05°, 30 nT"],
+        ["no", "the field's spectrum", "± 0.1°, 0.05°, 30 nT"],
+        ["—", "the position", "—"],
+    ]
+    labels = [flights.names({"name": "kalman", "confidence": value})[0] for value in (0.8, 0)]
+    assert labels == ["Kalman (dual control), declares at 0.8", "Kalman (dual control), declares at once"]
+    rows = [["a", "", "no", "x", "exact"], ["a", "", "no", "y", "exact"], ["b", "", "no", "y", "exact"]]
+    assert flights.titles_of(flights.ABOUT, rows)[1:] == [
+        "a (start: no; map: y; elements at the destination: exact)",
+        "b",
     ]
     monkeypatch.setattr(flights, "flown", lambda flight, _: flight.rules["target_std"])
-    assert [made.fly(spec, LEVELS[0]) for spec in (measured, own)] == [(0.0, 0.0, 0.0), None]
+    assert [made.fly(spec, LEVELS[0]) for spec in (measured, own, exact)] == [std, None, [0, 0, 0]]
 
 
 def test_differences_are_of_correct_arrivals_where_cells_are() -> None:
     """Of vehicles that declare with any confidence, all are right or wrong, but those that never came near."""
-    options = {**NEAR, "within_km": 25, "conditions": ["ship"], "against": ["secant"]}
+    options = {**NEAR, "within_km": 25, "conditions": ["ship"], "against": [(0, 1)]}
     measures = ("success_rate", "false_arrival_rate")
     table = rows(grid.flights(["geodesic", "secant"], measures=measures, **options).text)
     assert table[4][0].endswith("secant (quasi-Newton), correct arrivals")
-    shares = [[float(share) for share in row[3].split(" / ")] for row in table[2:4]]
-    assert float(table[4][3].strip("*").split(" ")[0]) == shares[0][0] - shares[1][0]
+    shares = [[float(share.split(" ± ")[0]) for share in row[5].split(" / ")] for row in table[2:4]]
+    assert float(table[4][5].strip("*").split(" ")[0]) == shares[0][0] - shares[1][0]
     assert sum(shares[0]) == 100 > sum(shares[1])
     assert shares[0] != shares[1]
 
@@ -150,8 +162,8 @@ def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -
     assert set(episodes["track"]) == {"north-v1"}
     assert episodes["task"].tolist() == 4 * [0, 1, 2]
     ends = episodes.groupby(["navigator", "level"])[["success", "spl"]].mean() * 100
-    for name, _, _, *cells in table[2:4]:
-        for level, cell in zip(table[0][3:], cells, strict=True):
+    for name, _, _, _, _, *cells in table[2:4]:
+        for level, cell in zip(table[0][5:], cells, strict=True):
             assert cell == "{:.1f} / {:.1f}".format(*ends.loc[(name, level)])
     assert episodes["final_distance_km"].between(0, 25)[episodes["success"]].all()
     assert 0 < episodes["success"].sum() < 12
@@ -167,6 +179,12 @@ def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:
     runs = [ends | {"spl": torch.tensor([spl])} for spl in (0.9, 0.8)]
     assert flights.cell(runs, ("success_rate", "spl", "steps")) == "100.0 / 85.0 [80.0–90.0] / 10.0"
     assert flights.cell(runs[:1], ("spl", "steps")) == "90.0 / 10.0"
+
+
+def test_arrivals_have_intervals_that_are_clustered_by_region() -> None:
+    """By hand: in four regions of two tasks each, all or none of which succeed, the variance is 1 / 3 / 4."""
+    success, region = torch.tensor([1, 1, 0, 0, 1, 1, 0, 0]).bool(), torch.tensor([0, 0, 1, 1, 2, 2, 3, 3])
+    assert flights.shown(50.0, success, region) == f"50.0 ± {196 * (1 / 12) ** 0.5:.1f}"
 
 
 def test_the_interval_of_a_difference_is_clustered_by_region() -> None:

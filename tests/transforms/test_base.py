@@ -40,6 +40,7 @@ from magrl.transforms import (
     SensorErrors,
     SPLReward,
     TargetDifference,
+    TargetErrors,
     TrackField,
     TrueWay,
     sensor_levels,
@@ -83,7 +84,7 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
     "rewarded": (nav, rewarded),
     "every error": (nav, every_error),
-    "compass": (nav, lambda: Compose(sensor_errors(), MagneticNorth())),
+    "compass": (nav, lambda: Compose(sensor_errors(), MagneticNorth(), TargetErrors((0.1, 0.05, 30.0)))),
     "declared": (partial(nav, arrival="declared"), declared),
     "scaled pendulum": (PendulumEnv, pendulum),
 }

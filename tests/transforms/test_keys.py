@@ -93,6 +93,7 @@ OPTIONS: dict[type[Transform], dict] = {
     transforms.NorthReferenceError: {"constant_deg": 2.0},
     transforms.RandomStepPrice: {"price_range": (0.1, 1.0)},
     transforms.SensorErrors: {"noise": STD},
+    transforms.TargetErrors: {"target_std": STD},
     transforms.Spikes: {"sizes": STD, "rate": 0.5},
 }
 IN_KEYS = {AngleVector: ["heading"], EpisodeSum: ["number"], MinMaxNorm: ["move"]}
@@ -102,7 +103,7 @@ IN_KEYS |= {
     DeclareArrival: READ_KEYS,
 }
 OUT_KEYS = {AngleVector: ["course"], EpisodeSum: ["episode_number"], MinMaxNorm: ["scaled"]}
-FIXED = (transforms.MagneticNorth, EpisodeSum, DeclareArrival)
+FIXED = (transforms.MagneticNorth, transforms.TargetErrors, EpisodeSum, DeclareArrival)
 """Those whose out_keys follow from their in_keys."""
 
 

@@ -93,7 +93,7 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (start, (TARGET, HERE), {"date": "tomorrow", "model": None}, "tomorrow"),
     (start, (TARGET, HERE), {"start_std": (0.1, -1.0, 5.0)}, "start_std must be a finite number from 0 on, got -1"),
     (start, (TARGET,), {"target_elements": TARGET}, "target_elements .* need the place of the target"),
-    (start, (BERGEN,), DATE | {"target_elements": THERE}, r"target_elements need target_std, .* such as \(0\.2"),
+    (start, (BERGEN,), DATE | {"target_elements": THERE}, r"target_elements need target_std, .* such as \(0\.1"),
     (start, (BERGEN,), DATE | {"target_std": NOISE}, "target_std .* needs the target_elements"),
     (start, (BERGEN,), DATE | UPWARD, "target_elements .* do not fit the target, .*: it fits with -I"),
     (

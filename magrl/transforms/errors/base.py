@@ -276,7 +276,7 @@ class ReadingErrors(EpisodeErrors):
         if tensordict.get(self.true_keys[0], None) is None:
             tensordict.set(self.true_keys[0], value)
         folds = self.changes_inclination and reading.shape[-1] == 3
-        self._write_named(tensordict, field=_folded(reading) if folds else reading)
+        self._write_named(tensordict, field=folded(reading) if folds else reading)
         accuracy = SensorStd(*self._accuracy.to(reading.dtype)) if accuracy is None else accuracy
         accuracy = accuracy if self.stated is None else SensorStd(*reading.new_tensor(self.stated))
         for key, std in zip(STD_KEYS, accuracy, strict=True):
@@ -294,7 +294,7 @@ class ReadingErrors(EpisodeErrors):
         return observation_spec
 
 
-def _folded(elements: Tensor) -> Tensor:
+def folded(elements: Tensor) -> Tensor:
     """Return D, I, B_H ``(..., 3)`` with I in [-90, 90]: beyond the vertical, the horizontal field is reversed."""
     declination, inclination, horizontal = elements.unbind(-1)
     folded = wrap_longitude(declination + 180), torch.sign(inclination) * 180 - inclination, horizontal

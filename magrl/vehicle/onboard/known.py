@@ -122,7 +122,7 @@ def _destination(journal: Journal, model: EarthModel | None) -> tuple[Triple, Tr
         raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
     if journal.target_std is None:
         raise ValueError(
-            "target_elements need target_std, their errors with the field of the crust there, such as (0.2, 0.1, 60)"
+            "target_elements need target_std, their errors with the field of the crust there, such as (0.1, 0.05, 30)"
         )
     measured, _ = known_elements(measured, "target_elements", None)
     assert model is not None

@@ -14,7 +14,7 @@ from magrl.envs.navigation import anywhere_env
 from magrl.envs.random_regions import planet_scenario
 from magrl.geodesy import geodesic
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors
+from magrl.transforms import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors, TargetErrors
 from magrl.transforms.errors.base import gauss_markov
 
 ERRORS = {"motion_error": 0, "weather_clock": 0, "sensor_error": 6, "north_error": 0}
@@ -86,8 +86,23 @@ def test_a_known_place_has_its_root_mean_square_error() -> None:
         assert apart.square().mean().sqrt().item() == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize("north", [False, True])
+def test_elements_at_the_destination_have_one_error_in_an_episode_and_the_episode_is_as_before(north: bool) -> None:
+    """Whether D is measured or not; arrival and objective are the true ones."""
+    compass, error = [MagneticNorth(), MagneticNorth()], TargetErrors((0.1, 0.05, 30.0))
+    env, plain = (under(*compass[k : k + north], *[error][k:], num_envs=2000) for k in (0, 1))
+    states, others = (flown(one, actions(3, 2000)) for one in (env, plain))
+    error = states[0]["target_field"] - others[0]["target_field"]
+    torch.testing.assert_close(error.std(0), torch.tensor([0.1, 0.05, 30.0]), rtol=0.06, atol=0)
+    assert error.mean(0).abs().less(torch.tensor([0.01, 0.005, 3.0])).all()
+    for state, other in zip(states, others, strict=True):
+        assert torch.equal(state["target_field"], states[0]["target_field"])
+        assert torch.equal(state["exact_target_field"], other["target_field"])
+        assert_same(other.exclude("target_field"), state)
+
+
 def test_true_keys_are_those_that_are_written() -> None:
-    keys = {key for env in (all_errors(), under(MagneticNorth())) for key in env.reset().keys()}  # noqa: SIM118
+    keys = {key for env in (all_errors(), under(MagneticNorth(), TargetErrors())) for key in env.reset().keys()}  # noqa: SIM118
     assert keys - set(nav(drift_km=0.0).reset().keys()) - set(STD_KEYS) == set(TRUE_KEYS)
 
 

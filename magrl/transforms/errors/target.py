@@ -1,0 +1,91 @@
+"""Errors of the elements at the destination: a survey or a chart that gives them is not exact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite
+
+from magrl.counters import stream_normal
+from magrl.transforms.base import Keys
+from magrl.transforms.errors.base import Episode, EpisodeErrors, check_sizes, folded
+
+
+class TargetErrors(EpisodeErrors):
+    """Give a vehicle the elements at its destination with an error that is drawn for the episode.
+
+    What it read is kept at ``exact_target_field`` and given back to the environment for its step, so that objective and
+    arrival stay true. It stands after :class:`~magrl.transforms.MagneticNorth`, if both are used: a vehicle without D
+    has a ``target_std`` of D of 0.
+
+    Args:
+        target_std: standard deviations of D [deg], I [deg], B_H [nT].
+        in_keys: elements at the destination ``(..., 3)``, which are replaced.
+        **options: ``seed``.
+
+    Raises:
+        ValueError: for a standard deviation that is negative or not finite, or another number of keys.
+        KeyError: for a step from a TensorDict without the state.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), TargetErrors((0.0, 0.0, 30.0)))
+        >>> state = env.reset()
+        >>> (state["target_field"] != state["exact_target_field"]).any(0)
+        tensor([False, False,  True])
+    """
+
+    channel = 12
+    true_keys = ("exact_target_field",)
+    default_in_keys = default_out_keys = ("target_field",)
+    numbers_key, stream_key = "target_error", "target_stream"
+    in_sizes = {"target_field": (3,)}
+    size = draws = 3
+
+    def __init__(
+        self, target_std: Sequence[float] = (0.0, 0.0, 0.0), in_keys: Keys | None = None, **options: Any
+    ) -> None:
+        super().__init__(in_keys, in_keys, **options)
+        check_sizes(3, target_std=target_std)
+        self.target_std = tuple(target_std)
+        self.in_keys_inv, self.out_keys_inv = list(self.in_keys), list(self.true_keys)
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it."""
+        return [self.numbers_key, self.stream_key, *self.true_keys]
+
+    def _constants(self, stream: Tensor) -> Tensor:
+        return torch.tensor(self.target_std, device=stream.device) * stream_normal(stream, self.draws)
+
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        tensordict.set(self.true_keys[0], values[0])
+        tensordict.set(self.out_keys[0], folded(values[0] + episode.numbers))
+        return episode.numbers
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Give the exact elements to the environment."""
+        state = self._state(tensordict)
+        return tensordict if state is None else tensordict.set(self.in_keys_inv[0], state[-1])
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the exact elements and the state; the elements with an error are unbounded."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        leaf = observation_spec[self.in_keys[0]]
+        observation_spec[self.true_keys[0]] = leaf.clone()
+        self._add(observation_spec, leaf, self.out_keys[0], 3)
+        return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Make the state, and the elements with an error, part of the input."""
+        input_spec = super().transform_input_spec(input_spec)
+        state, key = input_spec["full_state_spec"], self.in_keys_inv[0]
+        if state is not None and key in state.keys(True, True):
+            self._add(state, state[key], key, 3)
+        return input_spec
