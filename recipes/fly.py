@@ -148,18 +148,14 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
         tasks = Tasks(start[None], target[None])
         size = {"region": region, "margin_deg": 0, "distance_range_km": (0.0, distance_km)}
         scenario = Scenario(**size, field=field, tasks=tasks, date=config.date)
+        given = ("errors", "north", "model", "start_km", "target_std", "seed")
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
-                errors=config.errors,
-                north=config.north,
-                model=config.model,
-                start_km=config.start_km,
-                target_std=config.target_std,
+                **{key: getattr(config, key) for key in given},
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
-                seed=config.seed,
                 arrival=arrival,
                 confidence=config.confidence,
             )
