@@ -46,6 +46,8 @@ from tqdm import tqdm
 RECIPE = "fly.py"
 RULES = {"with_signal": "objective", "without_signal": "declared"}
 """Rules of arrival of the two flights: with an arrival signal, and declared by the vehicle within 25 km."""
+TOLD = ("errors", "north", "model", "start_km", "confidence", "seed")
+"""Settings that a flight is given as they are."""
 ARRIVAL_KM = 400.0
 """Distance up to which the arrival threshold is 0.01; beyond, it decreases so that the arrival radius is constant."""
 
@@ -150,16 +152,11 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
-                errors=config.errors,
-                north=config.north,
-                model=config.model,
-                start_km=config.start_km,
+                **{key: getattr(config, key) for key in TOLD},
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
-                seed=config.seed,
                 arrival=arrival,
-                confidence=config.confidence,
             )
             navigator = flight.navigator(config.navigator)
             flights[name] = flight.env_of(navigator, track=True), Watched(navigator, distance_km)
