@@ -17,7 +17,7 @@ def end(signum: int, frame: FrameType | None) -> None:  # noqa: ARG001
 
 def importer() -> str | None:
     """Return the name of the module that imports this one."""
-    frame = sys._getframe(1)
+    frame: FrameType | None = sys._getframe(1)
     while frame is not None and (frame.f_code.co_filename.startswith("<frozen") or frame.f_globals is globals()):
         frame = frame.f_back
     return None if frame is None else frame.f_globals.get("__name__")

@@ -21,6 +21,7 @@ from tensordict import TensorDict
 
 from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, load_policy, paper
 from magrl.envs.navigation import no_go_env
+from magrl.navigators import policy_env
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
 from magrl.transforms import SensorErrors
@@ -81,7 +82,8 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     losses = getattr(module, "LOSSES", ("loss_critic", "loss_actor"))
     assert all(math.isfinite(float(rows[-1][key])) for key in losses)
     policy = load_policy(run / "policy.safetensors")
-    assert GeomagneticNavEnv(num_envs=3, seed=0).rollout(2, policy)["action"].isfinite().all()
+    env = policy_env(GeomagneticNavEnv(num_envs=3, seed=0), policy)
+    assert env.rollout(2, policy)["action"].isfinite().all()
     assert all(weight.isfinite().all() for weight in weights.values())
 
 
