@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import magrl.interrupts  # noqa: F401 - before what takes seconds
 import places
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
@@ -45,6 +46,8 @@ from tqdm import tqdm
 RECIPE = "fly.py"
 RULES = {"with_signal": "objective", "without_signal": "declared"}
 """Rules of arrival of the two flights: with an arrival signal, and declared by the vehicle within 25 km."""
+TOLD = ("target_std", "errors", "north", "model", "start_km", "confidence", "seed")
+"""Settings that a flight is given as they are."""
 ARRIVAL_KM = 400.0
 """Distance up to which the arrival threshold is 0.01; beyond, it decreases so that the arrival radius is constant."""
 
@@ -148,16 +151,14 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
         tasks = Tasks(start[None], target[None])
         size = {"region": region, "margin_deg": 0, "distance_range_km": (0.0, distance_km)}
         scenario = Scenario(**size, field=field, tasks=tasks, date=config.date)
-        given = ("errors", "north", "model", "start_km", "target_std", "seed")
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
-                **{key: getattr(config, key) for key in given},
+                **{key: getattr(config, key) for key in TOLD},
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
                 arrival=arrival,
-                confidence=config.confidence,
             )
             navigator = flight.navigator(config.navigator)
             flights[name] = flight.env_of(navigator, track=True), Watched(navigator, distance_km)

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.agents import load_policy
 from magrl.evaluation.tables import markdown_table
 from magrl.field.elements import NAMES

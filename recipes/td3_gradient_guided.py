@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from functools import cache
 
+import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.envs.navigation import NAMED_ENVS, storm_errors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import earth_scenario
 from magrl.envs import Region
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines

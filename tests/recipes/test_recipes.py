@@ -21,6 +21,7 @@ from tensordict import TensorDict
 
 from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, load_policy, paper
 from magrl.envs.navigation import no_go_env
+from magrl.navigators import policy_env
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
 from magrl.transforms import SensorErrors
@@ -56,7 +57,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     noise = {} if module is ppo_memory else {"noise": NOISE}  # the task has errors of its own
     short = "date = 2022-01-01\nregion = {latitude = [-30, 0], longitude = [150, 180]}\nmax_steps = 8"
     (tmp_path / "short.toml").write_text(short, encoding="utf-8")
-    frames = {"steps_per_batch": 2, "total_frames": 64, "eval_every": 2, **noise}
+    frames = {"steps_per_batch": 2, "total_frames": 192, "eval_every": 2, **noise}
     frames |= {"scenario": tmp_path / "short.toml"} if module is recipe else {}
     result = module.train(small(module, whole, **frames))
     with signalled(2, signal.SIGINT), pytest.raises(SystemExit) as stop:
@@ -72,7 +73,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "scenario.toml", "trajectories.png"}
     assert with_paths(whole) == []
     written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
-    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 64)
+    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 192)
     assert written["spl"] == result["spl"]
     assert config["recipe"] == module.RECIPE
     assert tuple(config.get("noise", NOISE)) == NOISE
@@ -81,7 +82,8 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     losses = getattr(module, "LOSSES", ("loss_critic", "loss_actor"))
     assert all(math.isfinite(float(rows[-1][key])) for key in losses)
     policy = load_policy(run / "policy.safetensors")
-    assert GeomagneticNavEnv(num_envs=3, seed=0).rollout(2, policy)["action"].isfinite().all()
+    env = policy_env(GeomagneticNavEnv(num_envs=3, seed=0), policy)
+    assert env.rollout(2, policy)["action"].isfinite().all()
     assert all(weight.isfinite().all() for weight in weights.values())
 
 
@@ -129,7 +131,7 @@ def test_options_reach_the_training(tmp_path: Path, outcome) -> None:
     for changed in ({}, {"objective_limit": 0.5}, {"guided": False}, {"time_limit_ends": True}):
         run = tmp_path / f"{len(found)}"
         recipe.train(small(recipe, run, num_envs=4, total_frames=240, eval_every=60, **changed))
-        (row,), weights = outcome(run)
+        (*_, row), weights = outcome(run)
         found.append(torch.cat([weight.flatten() for weight in weights.values()]))
         terms = [float(row[f"return_{term}"]) for term in ("destination", "proximity", "alignment")]
         assert math.isnan(terms[2]) == ("guided" in changed)
