@@ -126,7 +126,7 @@ def comparison_table(summaries: Summaries, *, published: bool = True) -> str:
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
-        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — | — | — |
+        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — | — | — | — |
     """
     rows = list[list[object]]()
     for kind, results in summaries.items():
@@ -182,7 +182,7 @@ def cell(results: Sequence[Summary], key: str, form: str) -> str:
 
 
 def short_table(summaries: Summaries) -> str:
-    """Return the main measures of navigators in eight columns, without the paper's rows.
+    """Return the main measures of navigators in nine columns, without the paper's rows.
 
     Args:
         summaries: by navigator, one summary for each run.
@@ -190,7 +190,7 @@ def short_table(summaries: Summaries) -> str:
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(short_table({"secant": [measures]}).splitlines()[2])
-        | secant (quasi-Newton) | nothing | 1 | 1.0 | 1.00 | 1.00 | 1.0 | 1.0 |
+        | secant (quasi-Newton) | nothing | 1 | 1.0 | 1.00 | 1.00 | 1.0 | 1.0 | 1.0 |
     """
     rows = []
     for kind, runs in summaries.items():

@@ -52,7 +52,7 @@ IRON = slice(COEFFICIENTS + 10, COEFFICIENTS + 13)
 """Errors that turn with the vehicle, such as hard iron: forward, to the right and downward [nT] in the state."""
 STATES = COEFFICIENTS + 13
 """Number of states."""
-ANOMALY_KM = 250.0
+ANOMALY_KM = 125.0
 """Correlation length of the anomaly [km]. WMMHR, degrees 14 to 133 at the ground, has .9 at 50 km, .62 at 100 km and
 .28 at 150 km; for a ship, it is four hours of magnetic weather."""
 MODEL_NT = 2.0

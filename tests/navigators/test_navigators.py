@@ -277,7 +277,7 @@ def test_a_reading_that_is_nan_is_not_flown(env) -> None:
 
 @pytest.mark.parametrize("name", sorted({*NAVIGATORS} - {"kalman"}))  # which is in anywhere
 def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch) -> None:
-    monkeypatch.setattr(sys.modules["magrl.tracking.destination.destination"], "_STEPS", 1)
+    monkeypatch.setattr(sys.modules["magrl.tracking.destination"], "_STEPS", 1)
     arrival = "declared" if name in ("anywhere", "dead_reckoning") else "objective"
     env = GeomagneticNavEnv(num_envs=2, seed=0, arrival=arrival)
     monkeypatch.setattr(Metaheuristic, "generations", 2)

@@ -104,7 +104,7 @@ def test_the_forecast_is_the_covariance_after_the_leg_is_flown(
     if missing is not None:
         errors = errors._replace(noise=NOISE.index_fill(0, torch.tensor([missing]), math.inf))
     for found, leg in zip(covariance_after(goal, way, moves, errors), moves, strict=True):
-        assert differs(found, flown_covariance(belief, goal, way, leg, errors)) < 0.016
+        assert differs(found, flown_covariance(belief, goal, way, leg, errors)) < 0.015
 
 
 def test_the_forecast_averages_the_noise_of_many_readings() -> None:

@@ -313,15 +313,16 @@ class Onboard:
         way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
         if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
             return "out of range", f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}"
-        if not decision.declare.item() or doubt.level > LOST_SURPRISE:
+        declare, last = decision.declare.item(), self._number >= options.max_steps - 1
+        if not (declare or last) or doubt.level > LOST_SURPRISE:
             return None, ""
-        if decision.probability.item() >= options.confidence:
+        if declare and decision.probability.item() >= options.confidence:
             probability = f"an estimated probability of {decision.probability.item():.2f}"
             if doubt.fit < LEAST_FIT:
                 return "nearest", f"{probability}, but readings do not fit what is stated (p = {doubt.fit:.1g})"
             return "arrived", f"within {options.radius_km:g} km with {probability}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
-        if self._number >= options.max_steps - 1:
+        if last:
             return "nearest", f"out of steps: {near}"
         if 0 < decision.attainable.item() < options.confidence:  # 0 where nothing is known yet
             return "nearest", f"as near as these sensors allow: {near}"
