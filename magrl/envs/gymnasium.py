@@ -59,6 +59,10 @@ def _observation_space(env: TransformedEnv, keys: tuple[str, ...], *, flat: bool
         return spaces.Dict({key: _box(spec[key]) for key in keys})
     # CatTensors drops the bounds of what it joins.
     joined = [step for step in env.transform if isinstance(step, CatTensors) and step.out_keys == ["observation"]]
+    bounds = [step.bounds for step in env.transform if hasattr(step, "bounds") and keys[0] in step.out_keys]
+    if bounds and not joined:
+        low, high = (np.array(end, np.float32) for end in bounds[-1])
+        return spaces.Box(low, high, dtype=np.float32)
     return _box(*(spec[key] for key in (joined[-1].in_keys if joined else keys)))
 
 

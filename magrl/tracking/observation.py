@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,15 @@ OBSERVATION_SIZE = 19
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
 _LEAST_PRICE = 0.01
+
+
+_NOISE = math.log(_LEAST_STD) / 2 + 1.99, math.log(OUTAGE_STD) / 2 + 2.01  # with room for rounding
+_OPEN = math.inf
+TRACK_BOUNDS = (
+    (*(-_OPEN,) * 2, -2.0, -0.5, *(-_OPEN,) * 6, -2.04, 0.0, *(_NOISE[0],) * 3, *(-_OPEN,) * 2, -1.0, -_OPEN),
+    (*(_OPEN,) * 3, 5.75, *(_OPEN,) * 7, 1.0, *(_NOISE[1],) * 3, *(_OPEN,) * 4),
+)
+"""Lowest and highest values of :func:`track_observation`."""
 
 
 def track_observation(

@@ -31,6 +31,14 @@ ACCURACY_KEYS = STD_KEYS[:2]
 """Keys of the accuracy that is observed: of errors that are new in each reading, and of all others."""
 
 
+_OPEN = math.inf
+READING_BOUNDS = (
+    (*(-1.0,) * 4, *(-_FARTHEST,) * 5, *(0.0,) * 3, *(-_OPEN,) * 5, -1.0, -1.0, 0.0, *(0.0,) * 6),
+    (*(1.0,) * 4, *(_FARTHEST,) * 8, *(_OPEN,) * 5, 1.0, 1.0, _OPEN, *(_FARTHEST,) * 6),
+)
+"""Lowest and highest values of :func:`observed_reading`."""
+
+
 class ReadingObservation(StatefulTransform):
     """Write the reading, the last leg and the change of the reading along it, scaled; nothing is estimated.
 
@@ -58,6 +66,7 @@ class ReadingObservation(StatefulTransform):
     default_in_keys = ("field", "target_field", "move", "heading")
     default_out_keys = ("observation",)
     optional_in_keys = ACCURACY_KEYS
+    bounds = READING_BOUNDS
     out_sizes = {"observation": (READING_SIZE,)}
 
     @property

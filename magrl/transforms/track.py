@@ -16,7 +16,7 @@ from magrl.checks import check_choice, check_type
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import Reading, Rules, Track, advance, begin, declaring
 from magrl.tracking.belief import LocalElements
-from magrl.tracking.observation import OBSERVATION_SIZE
+from magrl.tracking.observation import OBSERVATION_SIZE, TRACK_BOUNDS
 from magrl.tracking.pilot import observation
 from magrl.tracking.records import State
 from magrl.tracking.way import DestinationPosterior, Way
@@ -83,6 +83,7 @@ class TrackField(StatefulTransform):
 
     default_out_keys = ("track", "observation")
     optional_out_keys = ("observation",)
+    bounds = TRACK_BOUNDS
     in_sizes = {"field": (3,), "target_field": (3,), "heading": (1,), "elapsed_steps": (1,)}
 
     def __init__(

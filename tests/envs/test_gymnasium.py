@@ -424,3 +424,14 @@ def test_without_stable_baselines3_the_extra_is_named(monkeypatch) -> None:
     monkeypatch.delitem(sys.modules, "magrl.envs.sb3", raising=False)
     with pytest.raises(ImportError, match=r"pip install 'magrl\[sb3\]'"):
         importlib.import_module("magrl.envs.sb3")
+
+
+@pytest.mark.parametrize("task", ["anywhere", "readings", "storm"])
+def test_observations_stay_within_their_bounds(task: str) -> None:
+    """Of random flights that end far away; the parts that are clamped have finite bounds."""
+    envs = GeomagneticNavVectorEnv(16, task=task, max_steps=20)
+    space, seen = envs.single_observation_space, [envs.reset(seed=0)[0]]
+    envs.action_space.seed(0)
+    seen += [envs.step(envs.action_space.sample())[0] for _ in range(20)]
+    assert all(space.contains(row) for rows in seen for row in rows)
+    assert np.isfinite(space.high).sum() == (5 if task == "anywhere" else 20)

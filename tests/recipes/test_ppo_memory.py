@@ -14,6 +14,7 @@ from torchrl.envs.utils import check_env_specs
 
 from magrl import load_policy, planet_scenario, save_policy
 from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation import evaluation_rollout
 from magrl.navigators import policy_env
 from magrl.navigators.memory import Memory, MemoryNetwork
 from magrl.tracking.network import pretrained
@@ -146,3 +147,11 @@ def test_a_file_of_an_agent_holds_its_network_and_no_other(tmp_path) -> None:
     save_policy(tmp_path / "broken.safetensors", Memory(saved))
     with pytest.raises(ValueError, match=r"broken\.safetensors does not hold a valid memory: .*weight_hh_l0"):
         Memory(tmp_path / "broken.safetensors")
+
+
+def test_a_memory_keeps_to_shorter_limits() -> None:
+    env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random", max_steps=4)
+    for limit in (7.0, 90.0):
+        agent = Memory(network(), max_move_km=limit)
+        assert agent.max_move_km == min(limit, 50.0)
+        assert evaluation_rollout(env, agent)["action"][..., 0].max() <= min(limit, 50.0) + 1e-4

@@ -15,6 +15,7 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking import Reading, Rules, act, advance, begin, declaring, earth_model, pilot
 from magrl.tracking.belief import Belief, start
 from magrl.tracking.decision import ArrivalDecision
+from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.records import State
 from magrl.tracking.search import VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
 from magrl.tracking.way import Way
@@ -56,6 +57,38 @@ def test_the_first_reading_counts_with_twice_its_noise(readings) -> None:
     found = begin(RULES, readings[0]).state.beliefs
     without_anomaly = Belief(found.mean[:, 0], found.covariance[:, 0], found.place[:, 0])
     torch.testing.assert_close(without_anomaly, wanted, rtol=0.02, atol=0.1, equal_nan=True)  # it may be a spike
+
+
+def test_the_error_of_a_leg_turns_with_its_heading() -> None:
+    """10 km along and 1 km across a leg to the east, and to the northeast."""
+    found = pilot._leg_covariance(f64(10.0, 1.0).expand(2, 2), f64(math.pi / 2, math.pi / 4))
+    expected = torch.stack((f64((1.0, 0.0), (0.0, 100.0)), f64((50.5, 49.5), (49.5, 50.5))))
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_an_unknown_displacement_carries_the_slope_of_the_field(readings) -> None:
+    """The covariance of the coefficients grows by the slopes times that of the displacement."""
+    belief, square = begin(RULES, readings[0]).state.belief, torch.diag(f64(9.0, 4.0))
+    slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)
+    grown = (pilot.displaced(belief, square).covariance - belief.covariance)[..., :COEFFICIENTS, :COEFFICIENTS]
+    torch.testing.assert_close(grown, slope @ square @ slope.mT, rtol=1e-6, atol=1e-6)
+    assert grown.diagonal(dim1=-2, dim2=-1)[..., 0].min() > 0
+
+
+def test_the_accuracy_of_a_reading_is_as_the_readings_show_it(readings) -> None:
+    state = advance(RULES, begin(RULES, readings[0]).state, readings[1]).state
+    noisier = state._replace(log_ratio=0 * state.log_ratio + math.log(4), readings=0 * state.readings + 100)
+    assert (noisier.noise.factor > 1.5).all()
+    found, stated = pilot._accuracy(noisier, readings[1]).noise, readings[1].std.noise
+    torch.testing.assert_close(found, stated * noisier.noise.factor)
+
+
+def test_a_spike_in_the_first_reading_hardly_counts(readings) -> None:
+    """Of a vehicle that knows its place: 100 standard deviations move the field by less than five."""
+    seen = readings[0]._replace(place=PLACE.expand(4, 2), target_place=(PLACE + 3).expand(4, 2))
+    exact = MODEL.elements(PLACE.expand(4, 2))
+    still, hit = (begin(Rules(**KNOWN), seen._replace(field=exact + f64((0.0, off, 0.0)))) for off in (0.0, 5.0))
+    assert ((hit.local.value - still.local.value)[:, 1].abs() < 5 * STD[1]).all()
 
 
 MODEL, PLACE = earth_model("IGRF-14", "2025-01-01"), f64(5.0, 20.0)

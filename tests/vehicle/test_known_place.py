@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from magrl.tracking import advance, earth_model
 from magrl.tracking.belief import PLACE, Motion, at_place, settled, updated
 from magrl.tracking.pilot import position_fix
 from magrl.vehicle.onboard import Command, Onboard
+from magrl.vehicle.onboard.doubt import Doubt
 
 BERGEN, DATE, FIELD = (60.4, 5.3), "2026-06-30", IGRF("2026-06-30")
 NEAR = (60.43, 5.3)
@@ -267,3 +269,14 @@ def test_a_vehicle_whose_sensors_all_hang_is_lost() -> None:
 def at_km(north_km: float) -> float:
     """The latitude so far north of Bergen."""
     return move_place(f64(*BERGEN), f64(0.0)[0], f64(north_km)[0])[0].item()
+
+
+def test_a_doubt_stays_and_counts_the_first_reading() -> None:
+    """Of a right reading after a surprising one, and of right readings after a first one that hardly fitted."""
+    right = SimpleNamespace(tail=torch.tensor(0.7), surprise=torch.tensor(1.0))
+    wrong = SimpleNamespace(tail=torch.tensor(1e-6), surprise=torch.tensor(30.0))
+    doubt = Doubt().after(right, first=True).after(wrong, first=False)
+    assert doubt.after(right, first=False).fit == doubt.fit < 1e-3
+    begun = Doubt().after(wrong, first=True)
+    assert begun.after(right, first=False).start == begun.start == (pytest.approx(1e-6),)
+    assert begun._replace(fit=1.0).after(right, first=False).fit < 1e-3
