@@ -36,6 +36,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
 from flights import ABOUT, MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of, titles_of
+from workers import die_with_parent
 
 from evaluate import Config, evaluate
 
@@ -84,12 +85,18 @@ def episodes_of(options: Mapping[str, Any], device: str, chosen: tuple[Spec, str
     return made.episodes(navigator, made.errors[level], device)
 
 
+def begin_worker() -> None:
+    """Give this process one thread, and end it with its parent."""
+    die_with_parent()
+    torch.set_num_threads(1)
+
+
 def mapped(function: Callable[[Any], Any], values: Sequence[Any], jobs: int) -> Iterator[Any]:
     """Yield the results of a function in the order of its values, in some processes of one thread each."""
     if jobs == 1:
         yield from tqdm(map(function, values), total=len(values), unit="cell")
         return
-    with ProcessPoolExecutor(jobs, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), begin_worker) as pool:
         yield from tqdm(pool.map(function, values), total=len(values), unit="cell")
 
 

@@ -13,12 +13,10 @@ median SPL is kept in docs/results/agents, for agents.py.
 from __future__ import annotations
 
 import csv
-import ctypes
 import itertools
 import os
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -45,6 +43,7 @@ from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
 from magrl.registry import NAMED_TASKS
 from magrl.training import UsageError, command
+from workers import die_with_parent
 
 import numpy as np
 import torch
@@ -145,12 +144,6 @@ def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
     curve.point()  # after the last update
     save_agent(agent, model.policy, task)
     return curve.rows
-
-
-def die_with_parent() -> None:
-    """End this process when its parent ends, also by a kill (Linux), and quietly by Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
