@@ -17,7 +17,8 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
     Args:
         success: ``(...)`` bool.
         shortest_km: ``(...)`` geodesic distance from start to destination [km].
-        length_km: ``(...)`` length of the path [km].
+        length_km: ``(...)`` length of the path, as commanded: through the water or the air, where there are currents
+            [km].
 
     Returns:
         ``(...)`` in [0, 1]: 0 for a failure, 1 for a success on a path no longer than the shortest, also where both are

@@ -233,10 +233,10 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
 
 
 def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Return distance [km] and direction [rad] of legs over the ground, ``(...)`` each, in float64.
+    """Return distance [km] and direction [rad] of legs, ``(...)`` each, in float64.
 
-    They are what the policy commanded (``move``, ``heading``), unless errors of motion or of the north reference keep
-    what is true.
+    The distance is the commanded one, through the water or the air, which is what energy and time cost. The direction
+    is over the ground, where errors of motion or of the north reference keep it.
 
     Args:
         steps: what follows the legs, usually ``rollout["next"]``.
@@ -244,12 +244,11 @@ def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
     Example:
         >>> from tensordict import TensorDict
         >>> move, heading = torch.tensor([[30.0, 0.1]]), torch.tensor([[0.1]])
-        >>> moved(TensorDict(move=move, heading=heading, true_move=1.5 * move))[0]
-        tensor([45.], dtype=torch.float64)
+        >>> moved(TensorDict(move=move, heading=heading, true_course=2 * heading))
+        (tensor([30.], dtype=torch.float64), tensor([0.2000], dtype=torch.float64))
     """
-    move = steps.get("true_move", steps["move"])
     course = steps.get("true_course", steps.get("true_heading", steps["heading"]))
-    return move[..., 0].double(), course.squeeze(-1).double()
+    return steps["move"][..., 0].double(), course.squeeze(-1).double()
 
 
 def _turns(heading: Tensor, moving: Tensor) -> Tensor:

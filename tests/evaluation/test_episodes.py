@@ -173,14 +173,14 @@ def test_measures_of_episodes_by_hand(legs: list, target: tuple, success: bool, 
         assert float(got[key]) == pytest.approx(value, abs=TOLERANCES.get(key, 1e-4), nan_ok=True), key
 
 
-def test_moves_over_the_ground_are_the_true_ones() -> None:
-    """Those of the errors of motion, or else of the north reference, or else those that were commanded."""
+def test_legs_have_the_commanded_distance_and_the_true_direction() -> None:
+    """The direction of the errors of motion, or else of the north reference, or else the commanded one."""
     steps = TensorDict(move=torch.tensor([[1.0, 0.0]]), heading=torch.tensor([[0.1]]))
     for key, value, expected in (
         ("heading", 0.1, (1.0, 0.1)),
         ("true_heading", 0.2, (1.0, 0.2)),
         ("true_course", 0.3, (1.0, 0.3)),
-        ("true_move", 4.0, (4.0, 0.3)),
+        ("true_move", 4.0, (1.0, 0.3)),
     ):
         steps[key] = torch.full((1, 2 if key == "true_move" else 1), value)
         assert [value.item() for value in moved(steps)] == pytest.approx(expected)
