@@ -5,6 +5,7 @@ from magrl.tracking.pilot import act as act
 from magrl.tracking.pilot import advance as advance
 from magrl.tracking.pilot import begin as begin
 from magrl.tracking.pilot import declaring as declaring
+from magrl.tracking.pilot import retargeted as retargeted
 from magrl.tracking.records import Reading as Reading
 from magrl.tracking.records import Rules as Rules
 from magrl.tracking.records import Track as Track

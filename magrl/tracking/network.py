@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -154,3 +155,24 @@ def pretrained(name: str) -> Path:
     """
     check_choice(sorted(path.stem for path in _PRETRAINED.glob("*.safetensors")), pretrained_policy=name)
     return _PRETRAINED / f"{name}.safetensors"
+
+
+def pilot_of(navigator: str | Path | nn.Module) -> tuple[Rules, nn.Module | None] | None:
+    """Return the rules and the network of a pilot, None for any other navigator.
+
+    Args:
+        navigator: ``"kalman"``, which has no network; ``"anywhere"``; a file; or a module, which is copied.
+
+    Example:
+        >>> pilot_of("kalman"), pilot_of("secant")
+        ((Rules(), None), None)
+    """
+    rules: Any = getattr(navigator, "rules", None)
+    if navigator == "kalman":
+        return Rules(), None
+    if isinstance(rules, Rules):
+        return rules, copy.deepcopy(getattr(navigator, "network", None))
+    path = pretrained("anywhere") if navigator == "anywhere" else navigator
+    if isinstance(path, Path) or (str(path).endswith(".safetensors") and "rules" in policy_content(str(path))):
+        return load_pilot(str(path))
+    return None

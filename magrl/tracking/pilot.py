@@ -98,9 +98,28 @@ def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
     after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new, _count(beliefs, seen))
     rest = quiet, quiet, unvisited_yet(field), weights, home[..., 0], home, _declination(after, reading), none[..., 0]
     state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *rest)
+    return _surveyed(rules, state, reading), none[..., 0], tail
+
+
+def _surveyed(rules: Rules, state: State, reading: Reading) -> State:
+    """Return a state with the size of the anomaly at the destination, where a survey shows it."""
     if survey := _survey(rules, reading):
-        state = state._replace(there=anomaly_there(after, *survey, state.crust_nt, _true(reading, state.north).std))
-    return state, none[..., 0], tail
+        errors = _true(reading, state.north).std
+        return state._replace(there=anomaly_there(state.belief, *survey, state.crust_nt, errors))
+    return state._replace(there=torch.zeros_like(state.there))
+
+
+def retargeted(rules: Rules, state: State, reading: Reading) -> State:
+    """Return the state at the start of a trip to another destination, with what was learned.
+
+    Args:
+        rules: with what is known of that destination.
+        state: after the last reading.
+        reading: the last one, with that destination.
+    """
+    weights = arrival_weights(reading.field, reading.target, rules.zeta)
+    nothing = torch.zeros_like(state.path), torch.zeros_like(state.home)
+    return _surveyed(rules, state._replace(weights=weights, path=nothing[0], home=nothing[1]), reading)
 
 
 def _first_beliefs(rules: Rules, reading: Reading) -> Belief:

@@ -280,3 +280,24 @@ def test_a_doubt_stays_and_counts_the_first_reading() -> None:
     begun = Doubt().after(wrong, first=True)
     assert begun.after(right, first=False).start == begun.start == (pytest.approx(1e-6),)
     assert begun._replace(fit=1.0).after(right, first=False).fit < 1e-3
+
+
+@pytest.mark.parametrize("model", ["IGRF-14", "IGRF-2020"])
+def test_a_vehicle_goes_on_to_another_destination_with_what_it_learned(model: str, tmp_path: Path) -> None:
+    survey = {"target_elements": at(56.0, 56.0), "target_std": (0.1, 0.05, 30.0)}
+    place = move_place(f64(*BERGEN), f64(math.pi / 4), f64(56.0 * math.sqrt(2)))[0].tolist()
+    vehicle = begun(target=(61.4, 5.3), model=model, start_km=5.0)
+    with pytest.raises(RuntimeError, match="no estimate to keep"):
+        vehicle.retarget(place)
+    commands = [vehicle.step(*at(28.0 * number), heading=0.0, distance=28.0 * (number > 0)) for number in range(3)]
+    vehicle.retarget(place, **survey)
+    vehicle.save(tmp_path / "flight.json")
+    after = vehicle.step(*at(56.0), heading=0.0)
+    assert after.way_km == pytest.approx((0.0, 56.0), abs=8.0)
+    assert after.turn_deg == pytest.approx(90.0, abs=15.0)
+    assert after.place_covariance_km2[0][0] <= commands[-1].place_covariance_km2[0][0]
+    again = Onboard("kalman", sensor_std=(0.02, 0.02, 2.0), confidence=0.9)
+    again.restore(tmp_path / "flight.json")
+    assert again.step(*at(56.0), heading=0.0) == after
+    fresh = begun(target=place, model=model, start_km=5.0, **survey).step(*at(0.0), heading=0.0)
+    assert after.error_radius_km < fresh.error_radius_km

@@ -52,6 +52,15 @@ class Doubt(NamedTuple):
         return len(self.surprises) >= _LEAST and self.level > LOST_SURPRISE
 
     @property
+    def contradiction(self) -> str:
+        """By how much readings contradict each other, with likely causes, as text."""
+        return (
+            f"readings deviate {self.level**0.5:.0f} times as much as expected: either elements are wrong (the sign of "
+            "I, its zero at the horizontal, their order, units), or heading or log drift more than stated, the "
+            "altitude changed, or a storm or a large anomaly disturbs the field"
+        )
+
+    @property
     def text(self) -> str:
         """Which elements are not read any more, as text."""
         names = ", ".join(name for name, off in zip(NAMES, self.hung, strict=True) if off)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import BeforeValidator, Field, model_validator
@@ -120,6 +120,7 @@ class Step(Inputs):
         ValueError: heading must be a finite number, got nan
     """
 
+    CALL: ClassVar[str] = "step"
     declination: float | None
     inclination: float | None
     horizontal_intensity: float | None
@@ -143,12 +144,28 @@ class Fix(Inputs):
         ValueError: std_km must be greater than 0, got 0.0
     """
 
+    CALL: ClassVar[str] = "fix"
     latitude: float = Field(ge=-90, le=90)
     longitude: float = Field(ge=-360, le=360)
     std_km: float = Field(gt=0, le=FARTHEST_START_KM)
 
 
-class Journal(Inputs):
+class Destination(Inputs):
+    """Hold the arguments of :meth:`~magrl.vehicle.onboard.Onboard.retarget`.
+
+    Example:
+        >>> Destination(target=(64.1, -21.9)).target_km
+        0.1
+    """
+
+    CALL: ClassVar[str] = "retarget"
+    target: Annotated[tuple[float, ...], _LAX]
+    target_elements: Triple | None = None
+    target_std: Triple | None = None
+    target_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
+
+
+class Journal(Destination):
     """Hold all inputs of a vehicle since its start, which determine its state with any navigator.
 
     Example:
@@ -157,19 +174,15 @@ class Journal(Inputs):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[16] = 16
+    format: Literal[17] = 17
     options: Annotated[Options, _LAX]
-    target: Annotated[tuple[float, ...], _LAX]
-    target_elements: Triple | None = None
-    target_std: Triple | None = None
     start: Annotated[tuple[float, ...], _LAX] | None = None
     start_std: Triple | None = None
     date: str | None = None
     altitude_km: float = 0.0
     model: str | None = None
     start_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
-    target_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
-    steps: Annotated[tuple[Annotated[Step, _LAX] | Annotated[Fix, _LAX], ...], _LAX] = ()
+    steps: Annotated[tuple[Annotated[Step, _LAX] | Annotated[Fix, _LAX] | Annotated[Destination, _LAX], ...], _LAX] = ()
 
     @classmethod
     def read(cls, path: Path) -> Journal:

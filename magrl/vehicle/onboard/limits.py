@@ -275,3 +275,19 @@ def stuck(unchanged: Sequence[float], max_move_km: float, useful: Sequence[bool]
     least_km = every_km if every else one_km
     names = [name for name, km, use, off in rows if use and km >= least_km and (every or not off)]
     return f"no change of {', '.join(names)} over {least_km:.0f} km: a sensor is stuck" if names else ""
+
+
+def in_radians(inclination: float, slope: float) -> str:
+    """Return that an inclination looks like radians, as text; empty if it does not.
+
+    Args:
+        inclination: as read.
+        slope: largest likely size of its gradient [1/km].
+
+    Example:
+        >>> in_radians(1.2, 0.0001)
+        'inclination 1.2 hardly changes: it looks like radians; degrees are expected'
+    """
+    if abs(inclination) > math.pi / 2 or 100 * slope >= EQUATOR_SLOPE_DEG:
+        return ""
+    return f"inclination {inclination:g} hardly changes: it looks like radians; degrees are expected"

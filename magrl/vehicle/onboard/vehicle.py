@@ -19,15 +19,15 @@ from torch import Tensor, nn
 from magrl.checks import check_type
 from magrl.files import write_atomically
 from magrl.sensor_std import OUTAGE_STD
-from magrl.tracking import Reading, Rules, Track, act, advance, begin, declaring
+from magrl.tracking import Reading, Rules, Track, act, advance, begin, declaring, retargeted
 from magrl.tracking.belief import PLACE
 from magrl.tracking.decision import ArrivalDecision
 from magrl.tracking.earth import NEWEST
-from magrl.tracking.network import load_pilot, policy_content, pretrained
+from magrl.tracking.network import pilot_of
 from magrl.tracking.records import State
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
-from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
+from magrl.vehicle.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
 from magrl.vehicle.onboard.known import check_first_reading, fixed, known_at_start
 
 USUAL: dict[str, Any] = {
@@ -78,7 +78,12 @@ class Onboard:
 
     def __init__(self, navigator: str | nn.Module = "anywhere", **options: Any) -> None:
         check_type((str, nn.Module), navigator=navigator)
-        rules, self._network, self._other = _source(navigator)
+        pilot, self._other = pilot_of(navigator), None
+        rules, self._network = pilot or (Rules(), None)
+        if pilot is None:
+            from magrl.vehicle.onboard.others import Other
+
+            self._other = Other(navigator)
         given = Options(**rules.model_dump() | USUAL | options)
         most = rules.model_dump(include={"max_move_km", "max_turn_deg"}) if self._network else {}
         name, module = "anywhere" if self._network else "kalman", self._network or nn.Identity()
@@ -137,25 +142,52 @@ class Onboard:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy; a place
                 without a model; or a model that does not cover the date.
         """
-        target = self._comparable(target) if len(target) == 3 else target
-        target_elements = None if target_elements is None else self._comparable(target_elements)
+        target, target_elements = self._comparable(target), self._comparable(target_elements)
         given: dict[str, Any] = {"target": target, "start": start, "start_std": start_std, "date": date}
         given |= {"target_elements": target_elements, "target_std": target_std}
         given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
         journal = Journal(options=self.options, **given)
-        rules, template = known_at_start(journal)
-        free = rules.start_km is not None and not (self._network or self._other)  # a filter with a place and a model
-        within = limits.ANYWHERE if free else self._range
-        if text := limits.out_of_range(within, template.target.tolist()):
-            raise ValueError(f"the target: {text}")
-        self._journal, self._rules, self._template, self._within = journal, rules, template, within
-        self._steps: tuple[Step | Fix, ...] = ()
+        self._take(journal)
+        self._journal = journal
+        self._steps: tuple[Step | Fix | Destination, ...] = ()
         self._number = 0  # of steps without fixes
         self._state: State | None = None
         self._last: Any = None  # the last elements
         self._doubt = Doubt()
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
+
+    def _take(self, journal: Journal) -> None:
+        """Take in what the vehicle knows at the start of a trip."""
+        rules, template = known_at_start(journal)
+        free = rules.start_km is not None and not (self._network or self._other)  # a filter with a place and a model
+        within = limits.ANYWHERE if free else self._range
+        if text := limits.out_of_range(within, template.target.tolist()):
+            raise ValueError(f"the target: {text}")
+        self._rules, self._template, self._within = rules, template, within
+
+    def retarget(self, target: Sequence[float | None], **known: Any) -> None:
+        """Go on to another destination with what was learned: field, place, drift and errors of the sensors.
+
+        The trip, and its number of steps, begin with the next :meth:`step`.
+
+        Args:
+            target: as for :meth:`start`.
+            **known: ``target_elements``, ``target_std`` and ``target_km``, as for :meth:`start`.
+
+        Raises:
+            RuntimeError: before the first :meth:`step`.
+            ValueError: as :meth:`start`.
+        """
+        if self._template is None or self._state is None:
+            raise RuntimeError("the vehicle has no estimate to keep: call start(target) and step() first")
+        known["target_elements"] = self._comparable(known.get("target_elements"))
+        trip = Destination(target=self._comparable(target), **known)
+        self._take(self._journal.replace(**dict(trip)))
+        with torch.inference_mode():
+            here = self._template._replace(field=torch.tensor(self._last, dtype=torch.float32))
+            self._state = retargeted(self._rules, self._state, here)
+        self._steps, self._number = (*self._steps, trip), 0
 
     def step(
         self,
@@ -239,7 +271,9 @@ class Onboard:
                 track = advance(self._rules, self._state, reading)
             if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
                 raise ValueError("the estimate is not finite after this leg: check its distance and errors")
-            action, decision = self._act(track, reading)
+            network, other = self._network, self._other
+            move = other.move(reading) if other else act(self._rules, track, reading, network)
+            action, decision = declaring(self._rules, track, reading, move)
         if some and (reading.known is not None or self._state is not None):
             doubt = doubt.after(track, first=self._state is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
@@ -262,15 +296,10 @@ class Onboard:
             leg_std=torch.tensor(leg, dtype=torch.float64) if any(leg) else None,
         )
 
-    def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
-        """Return the action of the navigator, with its declaration, and the decision behind that."""
-        network, other = self._network, self._other
-        action = act(self._rules, track, reading, network) if other is None else other.move(reading)
-        return declaring(self._rules, track, reading, action)
-
     def _comparable(self, elements: Any) -> Any:
-        """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""
-        return (0.0, *elements[1:]) if self.options.magnetic else elements
+        """Return D, I, B_H, if these are given, with 0 for D where the vehicle does not measure it."""
+        three = elements is not None and len(elements) == 3
+        return (0.0, *elements[1:]) if three and self.options.magnetic else elements
 
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
@@ -335,13 +364,10 @@ class Onboard:
         if text := limits.stuck(self._unchanged, self.options.max_move_km, useful, self._doubt.hung):
             return text
         if self._doubt.lost:
-            causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
-            return f"readings deviate {self._doubt.level**0.5:.0f} times as much as expected: check {causes}"
-        inclination, local = self._last[1], track.local
+            return self._doubt.contradiction
+        local = track.local
         slope = local.gradient[1].norm() + 2 * local.covariance[1, 1:, 1:].trace().sqrt()
-        if useful[1] and abs(inclination) <= math.pi / 2 and 100 * slope.item() < limits.EQUATOR_SLOPE_DEG:
-            return f"inclination {inclination:g} hardly changes: it looks like radians; degrees are expected"
-        return ""
+        return limits.in_radians(self._last[1], slope.item()) if useful[1] else ""
 
     def save(self, path: Path | str) -> None:
         """Write the arguments of :meth:`start` and of all steps since to a file, for :meth:`restore`.
@@ -368,20 +394,5 @@ class Onboard:
         resumed = copy.copy(self)
         resumed.start(**{name: value for name, value in journal if name not in ("format", "options", "steps")})
         for step in journal.steps:
-            (resumed.fix if isinstance(step, Fix) else resumed.step)(**dict(step))
+            getattr(resumed, step.CALL)(**dict(step))
         self.__dict__ = resumed.__dict__
-
-
-def _source(navigator: str | nn.Module) -> tuple[Rules, nn.Module | None, Any]:
-    """Return the rules and the network of a pilot, or another navigator, which needs TorchRL."""
-    rules: Any = getattr(navigator, "rules", None)
-    if navigator == "kalman":
-        return Rules(), None, None
-    if isinstance(rules, Rules):
-        return rules, copy.deepcopy(getattr(navigator, "network", None)), None
-    path = pretrained("anywhere") if navigator == "anywhere" else navigator
-    if isinstance(path, Path) or (str(path).endswith(".safetensors") and "rules" in policy_content(str(path))):
-        return *load_pilot(str(path)), None
-    from magrl.vehicle.onboard.others import Other
-
-    return Rules(), None, Other(navigator)
