@@ -21,8 +21,10 @@ class NamedTask(NamedTuple):
         reference: navigator of docs/tables/bars.py that README names.
         bars: navigators there besides ``secant``, ``kalman`` and ``anywhere``, the oracle last.
         picture: navigator and episode of its picture.
-        transforms: classes in :mod:`magrl.transforms` that change the arrival; with them, ``"base"`` is no reward.
+        transforms: classes in :mod:`magrl.transforms` that change the episode, with their options, before the reward;
+            with them, ``"base"`` is no reward.
         options: options of the environment that it changes.
+        legs: whether an agent observes its last legs, by a map, in place of the readings.
 
     Example:
         >>> NAMED_TASKS["nogo"].id, NAMED_TASKS["box"].id
@@ -37,8 +39,9 @@ class NamedTask(NamedTuple):
     reference: str = "kalman"
     bars: tuple[str, ...] = ("geodesic",)
     picture: tuple[str, int] = ("kalman", 0)
-    transforms: tuple[str, ...] = ()
+    transforms: Mapping[str, Mapping[str, Any]] = {}
     options: Mapping[str, Any] = {}
+    legs: bool = False
 
     @property
     def id(self) -> str:
@@ -75,8 +78,27 @@ _ROWS = (
         reference="around",
         bars=("around", "sighted", "detour"),
         picture=("detour", 7),
-        transforms=("TrueWay", "NoGoAreas"),
+        transforms={"TrueWay": {}, "NoGoAreas": {}},
         options={"max_steps": 20},
+    ),
+    NamedTask(
+        "Eddies",
+        0,
+        "eddies_env",
+        13.0,
+        budget={"PPO": 1000, "SAC": 50, "TD3": 50, "TD3-magrl": 0},
+        reference="parallel",
+        bars=("parallel", "geodesic"),
+        picture=("eddies", 0),
+        transforms={"MotionError": {"eddies_km_h": 0.9, "eddy_km": 250.0, "speed_km_h": 1.0}, "TrueWay": {}},
+        options={
+            "max_move_km": 25.0,
+            "max_steps": 60,
+            "arrival": "distance",
+            "start_heading": "random",
+            "drift_km": 111.0,  # as far as the strongest current sets a vehicle in a leg
+        },
+        legs=True,
     ),
 )
 NAMED_TASKS = {row.title.lower(): row for row in _ROWS}

@@ -4,6 +4,7 @@
     python recipes/td3_gradient_guided.py --preset td3-fast   # the baseline without guidance
     python recipes/td3_gradient_guided.py --preset paper      # Table 1 and three additions; hours on a CPU
     python recipes/td3_gradient_guided.py --task nogo         # around no-go areas; six minutes
+    python recipes/td3_gradient_guided.py --task eddies       # in currents as fast as the vehicle; four minutes
     python recipes/td3_gradient_guided.py --resume RUN        # resume an interrupted run exactly
 
 See docs/start.md.
@@ -19,7 +20,7 @@ import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import guidance_pair, task_transforms
+from magrl.envs.navigation import guidance_pair, task_transforms, task_view
 from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
 from magrl.registry import NAMED_TASKS
@@ -32,6 +33,7 @@ from magrl.transforms import (
     EpisodeSum,
     FieldGradient,
     GradientHeading,
+    LegsView,
     ObservationView,
     ProgressReward,
     SensorErrors,
@@ -50,15 +52,16 @@ RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_noise")
 ENV_OPTIONS = {"objective_limit", "device"}
+TASKS = tuple(name for name, row in NAMED_TASKS.items() if {"GG-TD3", "TD3-magrl"} & row.budget.keys())
 
 
 class Config(rule_settings("start_heading"), RegionConfig):
     """Settings of a training; the defaults are the preset's."""
 
-    preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
-    """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance; nogo for the task."""
-    task: Literal["box", "nogo"] = "box"
-    """Named task: the paper's, or around no-go areas, with a reward for progress that pays the paper's 200 at last."""
+    preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo", "eddies"] = "fast"
+    """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance; or for a task."""
+    task: Literal[*TASKS] = "box"  # type: ignore[valid-type]
+    """Named task: the paper's; around no-go areas, or in eddies, with a reward for progress, and 200 at the arrival."""
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
 
@@ -136,21 +139,13 @@ PAPER = Config(
 )
 PRESETS = {"fast": Config(distance_cost=0.1), "paper": PAPER}
 PRESETS["td3-fast"] = Config(preset="td3-fast", guided=False)
-PRESETS["nogo"] = Config(
-    preset="nogo",
-    task="nogo",
-    guided=False,
-    distance_cost=0.1,
-    learning_rate=1.5e-3,
-    final_learning_rate=2e-5,
-    tau=0.03,
-    final_exploration_noise=0.05,
-    policy_noise=0.05,
-    noise_clip=0.15,
-    total_frames=563_200,
-    updates_per_batch=24,
-    batch_size=256,
-)
+NAMED = {"guided": False, "distance_cost": 0.1, "final_exploration_noise": 0.05}
+NOGO = {"learning_rate": 1.5e-3, "final_learning_rate": 2e-5, "tau": 0.03, "updates_per_batch": 24, "batch_size": 256}
+NOGO |= {"policy_noise": 0.05, "noise_clip": 0.15, "total_frames": 563_200}
+EDDIES = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "updates_per_batch": 16, "batch_size": 512}
+EDDIES |= {"exploration_noise": 0.3, "noise_clip": 0.3, "total_frames": 250_112, "gamma": 0.95, "time_limit_ends": True}
+EDDIES |= {"num_envs": 256, "num_cells": (256, 256), "init_random_frames": 5120, "eval_every": 80}
+PRESETS |= {name: Config(preset=name, task=name, **NAMED, **own) for name, own in (("nogo", NOGO), ("eddies", EDDIES))}
 PRESETS["td3-paper"] = PAPER.replace(preset="td3-paper", guided=False)
 
 
@@ -160,7 +155,7 @@ def of_the_task(config: Config) -> list[Transform]:
     return transforms and [*transforms, ProgressReward(), RewardScaling(0.0, 20.0)]
 
 
-def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:
+def make_env(base: GeomagneticNavEnv, view: LegsView | ObservationView, config: Config) -> TransformedEnv:
     """Add guidance by the true field, the sensors' noise, the agent's view and the scaled reward to the environment."""
     keys = ["reward", "reward_alignment"]
     guidance = [
@@ -175,7 +170,8 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     sums = [RewardSum(), *([EpisodeSum(terms)] if terms else [])]
     rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
     guided = guidance if config.guided else []
-    return TransformedEnv(base, Compose(*task, *guided, *sensors, *scaling, *rewards))
+    env = TransformedEnv(base, Compose(*task, *guided, *sensors))
+    return TransformedEnv(env, Compose(*view.needed(env), *scaling, *rewards), auto_unwrap=True)
 
 
 def make_collection(
@@ -211,14 +207,13 @@ def train(config: Config) -> dict[str, float]:
         options = config.rules | config.model_dump(include=ENV_OPTIONS) | dict(NAMED_TASKS[config.task].options)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
         validation, test = run.evaluation_envs(*of_the_task(config), **options)
-        observed = config.model_dump(include={"observe_heading", "observe_difference"})
-        view = base.observation_view(**observed, observe_areas="areas" in validation.observation_spec.keys())  # noqa: SIM118
+        view = task_view(base, config.task, **config.model_dump(include={"observe_heading", "observe_difference"}))
         env = make_env(base, view, config)
 
         # Networks
-        network = PolicyConfig(view, config.num_cells, config.layer_norm)
-        actor = network.make_actor(env.device)
-        critic = make_critic(view.size, config.num_cells, layer_norm=config.layer_norm, device=env.device)
+        shape = {"layer_norm": config.layer_norm, "geometry": "areas" in view.in_keys}
+        actor = (network := PolicyConfig(view, config.num_cells, **shape)).make_actor(env.device)
+        critic = make_critic(view.size, config.num_cells, **shape, device=env.device)
 
         # Loss, with clipped double Q and target policy smoothing
         loss = TD3Loss(actor, critic, **config.model_dump(include={"gamma", "policy_noise", "noise_clip"}))

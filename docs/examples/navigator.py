@@ -12,8 +12,8 @@ import math
 
 from magrl import GeomagneticNavEnv, Scenario, episode_measures, evaluation_rollout, summarize
 from magrl.geodesy import steer
+from magrl.guidance import displacement_to
 from magrl.navigators import Navigator
-from magrl.navigators.base import displacement_to
 
 import torch
 from tensordict import TensorDictBase

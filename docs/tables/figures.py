@@ -54,6 +54,7 @@ CURVES = {
 DATA = dict.fromkeys(CURVES, "results/learning.csv")
 DATA |= dict.fromkeys(("figures/fig-4-4-trajectories", "results/fig-4-5-convergence"), "results/comparison.md")
 DATA |= {"results/fig-4-6-boxes": "results/comparison.md", "figures/conditions": "results/conditions.csv"}
+DATA["figures/reliability"] = "results/reliability.csv"
 """Data of figures: the table is of the same evaluation."""
 SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
 """Navigators in the figures of Section 4."""
@@ -172,7 +173,7 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
 
     One panel is for white noise, one for the errors of vehicles; bars are intervals of 95 %, clustered by region.
     """
-    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    figure, rows = Figure(figsize=(9, 4.6), layout="constrained"), []
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, names in zip(panels, ((), ("aircraft", "ship", "underwater", "low-cost")), strict=True):
         flights = Flights(names, tasks=tasks, regions=min(tasks, 512), max_steps=80, within_km=25.0)
@@ -180,10 +181,12 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
         for (name, errors), (color, marker) in zip(flights.errors.items(), LOOKS.values(), strict=False):
             bins = reliability(flights.fly("anywhere", errors), flights.scenario.tasks.region, 25.0)
             axes.errorbar(*zip(*bins, strict=True), color=color, marker=marker, ms=4, lw=1.2, capsize=2, label=name)
+            rows += [(name, *one) for one in bins]
         axes.set_xlabel("stated probability [%]")
         axes.legend(fontsize=8)
     panels[0].set_ylabel("share of readings within 25 km [%]")
-    return {"figures/reliability": figure}
+    data = DataFrame(rows, columns=["errors", "stated", "observed", "half_interval"]).round(1)
+    return {"results/reliability": data, "figures/reliability": figure}
 
 
 def place_error(tasks: int = 64) -> Figures:

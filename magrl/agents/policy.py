@@ -18,7 +18,7 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.envs import Compose, EnvBase
+from torchrl.envs import Compose, EnvBase, Transform
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
@@ -28,11 +28,11 @@ from magrl.envs.scenario import rule_settings
 from magrl.files import save_tensors, write_atomically
 from magrl.navigators import Anywhere, Memory, Navigator
 from magrl.tracking.network import FILE_FORMAT, check_weights, policy_content, save_pilot
-from magrl.transforms import ObservationView, ReadingView
+from magrl.transforms import LegsView, ObservationView, ReadingView
 
-View = ObservationView | ReadingView
+View = ObservationView | LegsView | ReadingView
 _Std = Annotated[float, Field(ge=0)]
-VIEWS: dict[str, type[View]] = {"region": ObservationView, "readings": ReadingView}
+VIEWS: dict[str, type[View]] = {"region": ObservationView, "legs": LegsView, "readings": ReadingView}
 """What policies observe, by the kind that their files name."""
 
 
@@ -44,6 +44,7 @@ class PolicyConfig:
         view: what the policy observes, and its scaling: values scaled to a region, or plain readings.
         num_cells: width of each hidden layer; None for a network of another kind.
         layer_norm: whether hidden layers are normalized.
+        geometry: whether the first layer is :class:`~magrl.agents.networks.AreaGeometry`.
 
     Raises:
         TypeError: for a view of another type.
@@ -59,6 +60,7 @@ class PolicyConfig:
     view: View
     num_cells: tuple[int, ...] | None
     layer_norm: bool = True
+    geometry: bool = False
 
     def __post_init__(self) -> None:
         check_type(tuple(VIEWS.values()), view=self.view)
@@ -71,7 +73,8 @@ class PolicyConfig:
             raise ValueError(
                 f"num_cells must be the widths of the hidden layers with {type(self.view).__name__}, got None"
             )
-        return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
+        shape = {"layer_norm": self.layer_norm, "geometry": self.geometry}
+        return make_actor(self.view.size, self.num_cells, **shape, device=device)
 
 
 class TrainingSettings(rule_settings("zeta", "start_heading")):  # type: ignore[misc]
@@ -130,6 +133,12 @@ class FieldPolicy(Navigator):
         if "areas" in self.in_keys and "areas" not in tensordict.keys():  # noqa: SIM118
             raise ValueError("the policy observes no-go areas, the environment has none: fly it in no_go_env")
         return super().forward(tensordict)
+
+    def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:
+        """Return what an environment needs for it: also what its view needs, with the map of the environment."""
+        there = {*self.view.in_keys} <= {*env.observation_spec.keys()}
+        needed = [] if there else self.view.needed(env)
+        return [*needed, *super().transforms(env, **rules)]
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:  # noqa: ARG002
         """Return distance [km] and turn [rad], and the declaration if the network has one."""

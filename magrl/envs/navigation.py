@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,7 +26,9 @@ from magrl.transforms import (
     FieldGradient,
     GradientHeading,
     HighestSPL,
+    LegsView,
     MinMaxNorm,
+    ObservationView,
     ProgressReward,
     RandomStepPrice,
     ReadingObservation,
@@ -40,7 +43,7 @@ from magrl.transforms.errors import conditions
 from magrl.transforms.sequences import ACCURACY_KEYS
 from magrl.transforms.track import known_keys
 
-OBSERVATIONS = ("flat", "track", "readings", "dict")
+OBSERVATIONS = ("flat", "legs", "track", "readings", "dict")
 REWARDS = ("progress", "paper", "base", "spl")
 STORM = Path(conditions.__file__).with_name("storm.toml")
 """File of the errors of the task *Storm*."""
@@ -63,11 +66,12 @@ def navigation_env(
     Args:
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, scaled to the region: the input of the recipes'
-            networks. ``"track"`` adds ``observation``, ``(N, 19)``, the estimates of the own track
-            (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 26)``, readings without estimates
+            networks. ``"legs"`` adds ``observation``, ``(N, 45)``, what a map of the region says of the last eight legs
+            (:class:`~magrl.transforms.RecentLegs`). ``"track"`` adds ``observation``, ``(N, 19)``, estimates of the own
+            track (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 26)``, readings without estimates
             (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"dict"`` leaves the public
             keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view of
-            ``"flat"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
+            ``"flat"`` and of ``"legs"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
         transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
         reward: ``"progress"``, the default, is :class:`~magrl.transforms.ProgressReward`: kilometers nearer to the
             destination over 50, plus 10 at the arrival, minus 0.1 a step. ``"paper"`` is the paper's: decrease of the
@@ -154,12 +158,12 @@ def _planets() -> Scenario:
 def _observation(env: TransformedEnv, observation: str | Sequence[str]) -> list[Transform]:
     """Return the transforms of an observation; raise where it does not fit."""
     base = env.base_env
-    if observation == "flat":
+    if observation in ("flat", "legs"):
         if len(base.region) > 1:
-            message = f"observation='flat' is scaled to one region, the scenario has {len(base.region)}"
+            message = f"observation={observation!r} is of one region, the scenario has {len(base.region)}"
             raise ValueError(f"{message}: take observation='track', or 'dict' for raw readings")
-        env.view = base.observation_view()
-        return env.view.observation_transforms()
+        env.view = legs_view(base) if observation == "legs" else base.observation_view()
+        return [*env.view.needed(env), *env.view.observation_transforms()]
     if observation == "track":
         return [TrackField(Rules(**base.limits), known_keys(env.observation_spec))]
     if observation == "readings":
@@ -257,6 +261,62 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     return env
 
 
+def eddies_env(
+    num_envs: int = 1, *, eddies_km_h: float = 0.9, noise: Sequence[float] = (0.0, 0.0, 0.0), **options: Any
+) -> TransformedEnv:
+    """Return the environment *Box* of an underwater glider at 1 km/h, in eddies that are about as fast.
+
+    The currents are unknown, and other ones in each episode: a vehicle that steers for its destination is carried
+    around. It has a map of the field, so that each reading is a fix of its position, and shows the last set.
+
+    Args:
+        num_envs: vehicles in the batch.
+        eddies_km_h: root-mean-square speed of the eddies [km/h].
+        noise: standard deviations of the noise of D [deg], I [deg], B_H [nT].
+        **options: of :func:`navigation_env`, with other defaults: ``observation="legs"``, legs of at most 25 km, 60
+            steps, arrival within 25 km, and random start headings. A list of keys, or ``"dict"``, has no map.
+
+    Example:
+        >>> eddies_env(4, seed=0).rollout(3)["observation"].shape
+        torch.Size([4, 3, 45])
+    """
+    motion, _ = task_transforms("eddies", MotionError={"eddies_km_h": eddies_km_h})
+    sensors = [SensorErrors(noise)] if any(noise) else []
+    defaults = {"observation": "legs", **NAMED_TASKS["eddies"].options}
+    move_km = options.get("max_move_km", defaults["max_move_km"])
+    defaults["drift_km"] = math.ceil(motion.farthest_km(move_km) - move_km)
+    transforms = [motion, *sensors, *options.pop("transforms", ())]
+    return navigation_env(num_envs, transforms=transforms, **{**defaults, **options})
+
+
+def legs_view(base: GeomagneticNavEnv) -> LegsView:
+    """Return the view of the last legs in an environment.
+
+    Example:
+        >>> legs_view(GeomagneticNavEnv(seed=0)).max_steps
+        50
+    """
+    return LegsView(max_steps=base.max_steps, max_move_km=base.max_move_km, max_turn_rad=base.scenario.max_turn_rad)
+
+
+def task_view(base: GeomagneticNavEnv, task: str, **switches: bool) -> LegsView | ObservationView:
+    """Return what an agent observes on a named task.
+
+    Args:
+        base: its environment.
+        task: its name.
+        **switches: of :meth:`magrl.envs.GeomagneticNavEnv.observation_view`.
+
+    Example:
+        >>> task_view(GeomagneticNavEnv(seed=0), "nogo").size
+        22
+    """
+    row = NAMED_TASKS[task]
+    return (
+        legs_view(base) if row.legs else base.observation_view(**switches, observe_areas="NoGoAreas" in row.transforms)
+    )
+
+
 NAMED_ENVS: dict[str, Callable[..., TransformedEnv]] = {
     name: globals()[task.make] for name, task in NAMED_TASKS.items()
 }
@@ -279,11 +339,18 @@ def task_name(task: str) -> str:
     return name
 
 
-def task_transforms(task: str) -> list[Transform]:
-    """Return the transforms of a named task that change its arrival, before any reward.
+def task_transforms(task: str, **options: Mapping[str, Any]) -> list[Any]:
+    """Return the transforms of a named task that change its episodes, before any reward.
+
+    Args:
+        task: its name.
+        **options: other options of a transform, by the name of its class.
 
     Example:
         >>> [type(part).__name__ for part in task_transforms("nogo")], task_transforms("box")
         (['TrueWay', 'NoGoAreas'], [])
     """
-    return [getattr(every_transform, name)() for name in NAMED_TASKS[task].transforms]
+    return [
+        getattr(every_transform, name)(**{**own, **options.get(name, {})})
+        for name, own in NAMED_TASKS[task].transforms.items()
+    ]

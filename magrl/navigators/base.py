@@ -32,29 +32,6 @@ MEMORY = "memory"
 _REMEDY = "policy_env(env, policy) returns the environment that has it"
 
 
-def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
-    """Return the displacement that closes an error in the elements, by least squares.
-
-    Args:
-        error: ``(..., E)`` target elements minus measured elements, in comparable units.
-        jacobian: ``(..., E, 2)`` change of the elements, in the same units per km north and east.
-
-    Returns:
-        ``(..., 2)`` north, east [km]; finite for singular equations. NaN in gives NaN out.
-
-    Example:
-        >>> displacement_to(torch.tensor([2.0, 1.0]), torch.tensor([[0.0, 0.1], [0.5, 0.0]]))
-        tensor([ 2., 20.])
-    """
-    wide, sides = jacobian.double(), error.double().unsqueeze(-1)  # the normal equations halve the digits
-    normal, right = wide.mT @ wide, (wide.mT @ sides).squeeze(-1)
-    ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).sum(-1) + 1e-30
-    a, b, c = normal[..., 0, 0] + ridge, normal[..., 0, 1], normal[..., 1, 1] + ridge
-    north, east = right.unbind(-1)
-    solved = torch.stack((c * north - b * east, a * east - b * north), -1) / (a * c - b * b).unsqueeze(-1)
-    return solved.to(error.dtype)
-
-
 def element_indices(elements: Sequence[str], least: int) -> list[int]:
     """Return the columns of ``field`` that hold some elements.
 

@@ -16,8 +16,8 @@ from magrl.field.bank import FieldBank
 from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
-from magrl.guidance import parallel_approach
-from magrl.navigators.base import Navigator, displacement_to, element_indices
+from magrl.guidance import displacement_to, parallel_approach
+from magrl.navigators.base import Navigator, element_indices
 from magrl.navigators.quasi_newton import CURVATURE
 from magrl.sensor_std import SensorStd
 

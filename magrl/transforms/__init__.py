@@ -28,6 +28,8 @@ from magrl.transforms.errors.spikes import Spikes as Spikes
 from magrl.transforms.errors.target import TargetErrors as TargetErrors
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
+from magrl.transforms.legs import Fix as Fix
+from magrl.transforms.legs import RecentLegs as RecentLegs
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import EpisodeSum as EpisodeSum
 from magrl.transforms.rewards import HighestSPL as HighestSPL
@@ -40,6 +42,7 @@ from magrl.transforms.sequences import ReadingObservation as ReadingObservation
 from magrl.transforms.track import DeclareArrival as DeclareArrival
 from magrl.transforms.track import TrackField as TrackField
 from magrl.transforms.views import AngleVector as AngleVector
+from magrl.transforms.views import LegsView as LegsView
 from magrl.transforms.views import ObservationView as ObservationView
 from magrl.transforms.views import ReadingView as ReadingView
 from magrl.transforms.views import TargetDifference as TargetDifference

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec, Unbounded
-from torchrl.envs import CatTensors, Transform
+from torchrl.envs import CatTensors, EnvBase, Transform
 
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES
 from magrl.transforms.areas import SEEN
 from magrl.transforms.base import Keys, ObservationTransform
+from magrl.transforms.legs import Fix, RecentLegs
 from magrl.transforms.scaling import MinMaxNorm
 
 READING_SIZES = {"field": 3, "target_field": 3, "move": 2, "heading": 1, "elapsed_steps": 1}
@@ -107,6 +109,10 @@ class _View:
     def __post_init__(self) -> None:
         check_number(0, above=True, max_move_km=self.max_move_km)
         check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
+
+    def needed(self, env: EnvBase) -> list[Transform]:  # noqa: ARG002
+        """Return the transforms that an environment needs before those of the observation: none."""
+        return []
 
     def action_transform(self, *, declared: bool = False) -> MinMaxNorm:
         """Return the transform from actions in [-1, 1] to distance [km] and turn [rad].
@@ -223,6 +229,55 @@ class ObservationView(_View):
                     f"the policy was trained where {name} is {least:.1f} to {most:.1f}{unit}; here it is {low:.1f} to "
                     f"{high:.1f}{unit}: train one for this region and date"
                 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LegsView(_View):
+    """Describe the observation of the last legs (:class:`~magrl.transforms.RecentLegs`), which needs a map.
+
+    Args:
+        count: number of legs.
+        max_steps: steps of an episode.
+        max_move_km: longest leg [km].
+        max_turn_rad: largest turn [rad].
+
+    Raises:
+        ValueError: for a count or a number of steps below 1, or a leg or a turn out of range.
+
+    Example:
+        >>> LegsView(max_steps=60, max_move_km=25.0, max_turn_rad=1.5).size
+        45
+    """
+
+    count: int = 8
+    max_steps: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number(1, whole=True, count=self.count, max_steps=self.max_steps)
+
+    @property
+    def in_keys(self) -> tuple[str, ...]:
+        """Key of the environment that is observed."""
+        return RecentLegs.default_out_keys[:1]
+
+    @property
+    def size(self) -> int:
+        """Number of entries of ``observation``."""
+        return RecentLegs(self.count).size
+
+    def needed(self, env: EnvBase) -> list[Transform]:
+        """Return the transforms that write what is observed, with the map of an environment."""
+        base: Any = getattr(env, "base_env", env)
+        known = [key for key in Fix.optional_in_keys if key in env.observation_spec.keys()]  # noqa: SIM118
+        return [
+            Fix(base.field, base.scenario.edge, [*Fix.default_in_keys, *known]),
+            RecentLegs(self.count, self.max_steps),
+        ]
+
+    def observation_transforms(self) -> list[Transform]:
+        """Return the transform from the key to ``observation`` ``(..., size)``."""
+        return [CatTensors(list(self.in_keys), "observation", del_keys=False)]
 
 
 @dataclass(frozen=True, kw_only=True)

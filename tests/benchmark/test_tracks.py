@@ -89,7 +89,7 @@ def test_the_trainings_have_as_many_planets_as_ever() -> None:
 @pytest.mark.parametrize("name", IDS)
 def test_environments_of_gymnasium_answer_to_actions_as_ever(name: str) -> None:
     same = {"num_envs": 4, "autoreset_mode": "SameStep"}
-    raw = {"observation": "dict", "scale_actions": False, "max_steps": 6}
+    raw = {"observation": "dict", "scale_actions": False, "max_steps": 6, "max_move_km": 50.0}
     base = {} if "NoGo" in name else {"reward": "base"}  # its numbers come from float64
     default, plain = (gymnasium.make_vec(name, **same, **options) for options in ({}, raw | base))
     default.reset(seed=0)

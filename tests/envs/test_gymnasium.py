@@ -125,7 +125,7 @@ def test_a_scenario_of_many_regions() -> None:
     envs = make_vec(scenario=planets, observation="track", reward="base")
     envs.reset(seed=0)
     assert np.isfinite(envs.step(random_actions(NUM, 0, 1)[0])[1]).all()
-    with pytest.raises(ValueError, match="scaled to one region, the scenario has 3: take observation='track'"):
+    with pytest.raises(ValueError, match="is of one region, the scenario has 3: take observation='track'"):
         make_vec(scenario=planets)
 
 
@@ -300,7 +300,10 @@ def test_bad_options() -> None:
         ({"num_envs": 2}, "makes one vehicle, without 'num_envs': use gymnasium.make_vec"),
         ({"autoreset_mode": "SameStep"}, "without 'autoreset_mode': use gymnasium.make_vec"),
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
-        ({"task": "boxes"}, "task must be one of 'box', 'anywhere', 'readings', 'storm', 'nogo', got 'boxes'"),
+        (
+            {"task": "boxes"},
+            "task must be one of 'box', 'anywhere', 'readings', 'storm', 'nogo', 'eddies', got 'boxes'",
+        ),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             make(**options)

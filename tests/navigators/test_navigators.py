@@ -17,8 +17,8 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
+from magrl.guidance import displacement_to
 from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant, policy_env
-from magrl.navigators.base import displacement_to
 from magrl.navigators.metaheuristics import Metaheuristic
 from magrl.navigators.quasi_newton import probe_length
 from magrl.sensor_std import STD_KEYS
