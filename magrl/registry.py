@@ -88,7 +88,7 @@ _ROWS = (
         13.0,
         budget={"PPO": 1000, "SAC": 50, "TD3": 50, "TD3-magrl": 0},
         reference="parallel",
-        bars=("parallel", "geodesic"),
+        bars=("parallel", "offset", "estimated", "geodesic", "mapped"),
         picture=("eddies", 0),
         transforms={"MotionError": {"eddies_km_h": 0.9, "eddy_km": 250.0, "speed_km_h": 1.0}, "TrueWay": {}},
         options={

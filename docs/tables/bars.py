@@ -1,22 +1,25 @@
-"""Bars of the named tasks: what navigators without training reach on the first episode of 200 vehicles.
+"""Bars of the named tasks: what navigators without training reach on the first episode of 1000 vehicles.
 
-    python docs/tables/bars.py    # a minute; prints them with their returns
+    python docs/tables/bars.py    # half an hour; prints them with their returns and CPU time
 
-The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 200 vehicles starts the same episodes. Oracles are
-the true bearing, which knows where vehicle and destination are, and the shortest paths around no-go areas, all or those
-seen so far. The rule around the areas in sight reads public keys alone. *Readings* has the episodes of *Anywhere*:
-only what a policy observes is different.
+The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 1000 vehicles starts the same episodes. Oracles are
+the true bearing, which knows where vehicle and destination are, the shortest paths around no-go areas, all or those
+seen so far, and the plan on the true map of the currents. Plans on estimated currents are of the first 200 vehicles.
+The rule around the areas in sight reads public keys alone. *Readings* has the episodes of *Anywhere*: only what a
+policy observes is different.
 """
 
 from __future__ import annotations
 
 import math
-from functools import cache
+import time
+from functools import cache, partial
+from typing import Any
 
 import magrl.interrupts  # noqa: F401 - before what takes seconds
+from currents import CURRENT_RULES
 from magrl.envs.navigation import NAMED_ENVS, storm_errors
 from magrl.evaluation import evaluation_rollout
-from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
@@ -28,19 +31,20 @@ from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distanc
 
 import torch
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.patches import Circle
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-VEHICLES = 200
-COLUMNS = ("SR", "SPL", "steps", "return")
+VEHICLES, FEWER = 1000, {"estimated": 200}
+COLUMNS = ("SR", "SPL", "steps", "return", "ms")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
 BARS |= {"told": "kalman, which knows the size of each error"}
 BARS |= {"around": "secant, least turn around the areas in sight"}
 BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}
+BARS |= {"parallel": "parallel (oracle)", "offset": "bearing that offsets half of the last set (a map)"}
+BARS |= {"estimated": "plan on a Gaussian process of the currents (a map, their spectrum)"}
+BARS |= {"mapped": "plan on the true currents (oracle)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
 
 
@@ -139,8 +143,15 @@ class Around(TensorDictModuleBase):
 def flown(task: str, navigator: str, vehicles: int | None = None) -> tuple[EnvBase, TensorDictBase]:
     """Return the environment of a task, and the first episode of each vehicle; arguments as of :func:`bar`."""
     errors = {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
-    env = NAMED_ENVS[task](vehicles or VEHICLES, observation="dict", scale_actions=False, seed=SEED, **errors)
-    rules = {"detour": Detour, "sighted": Sighted, "around": lambda: Around(Secant.for_env(env.base_env))}
+    observation = "legs" if NAMED_TASKS[task].legs else "dict"
+    count = min(vehicles or VEHICLES, FEWER.get(navigator, math.inf))
+    env = NAMED_ENVS[task](count, observation=observation, scale_actions=False, seed=SEED, **errors)
+    rules: dict[str, Any] = {
+        "detour": Detour,
+        "sighted": Sighted,
+        "around": lambda: Around(Secant.for_env(env.base_env)),
+    }
+    rules |= {name: partial(rule, env.base_env.max_move_km) for name, rule in CURRENT_RULES.items()}
     name = "kalman" if navigator == "told" else navigator
     policy = rules[name]() if name in rules else make_navigator(name, env.base_env)
     return env, evaluation_rollout(env, policy)
@@ -148,13 +159,15 @@ def flown(task: str, navigator: str, vehicles: int | None = None) -> tuple[EnvBa
 
 @cache
 def bar(task: str, navigator: str) -> dict[str, float]:
-    """Return the score of a navigator, as :func:`magrl.score`.
+    """Return the score of a navigator, as :func:`magrl.score`, and its CPU time a step and vehicle ``ms``.
 
     Args:
         task: name of the task.
         navigator: one of :data:`BARS`, or the file of a policy.
     """
-    return scored(flown(task, navigator)[1])
+    began = time.process_time()
+    rollout = flown(task, navigator)[1]
+    return {**scored(rollout), "ms": 1000 * (time.process_time() - began) / rollout.numel()}
 
 
 def bars_of(task: str) -> list[str]:
@@ -162,28 +175,14 @@ def bars_of(task: str) -> list[str]:
     return ["secant", "kalman", "anywhere", *NAMED_TASKS[task].bars]
 
 
-def draw_areas(axes: Axes, vehicle: int = 1) -> None:
-    """Draw the no-go areas of an episode, straight to the destination and around them, in the plane there."""
-    for name in ("geodesic", "detour"):
-        steps = flown("nogo", name)[1][vehicle]
-        numbers = steps["no_go_areas"][first_episode_mask(steps["next", "done"][None])[0]]
-        axes.plot(*numbers[:, -2:].flip(-1).T, ".-", label=BARS[name].partition(" (")[0])
-    centers, radii = NoGoAreas.discs(numbers[0])
-    for (north, east), radius in zip(centers.tolist(), radii.tolist(), strict=True):
-        axes.add_patch(Circle((east, north), radius, color="gray", alpha=0.3))
-    axes.plot(0, 0, "k^", label="destination")
-    axes.set(title="an episode of nogo", xlabel="east [km]", ylabel="north [km]", aspect="equal", adjustable="datalim")
-    axes.legend(fontsize="x-small", loc="best")
-
-
 def main() -> None:
     """Fly all navigators and print the table."""
     rows = [
-        [task, BARS[name], *(f"{bar(task, name)[key]:.1f}" for key in COLUMNS)]
+        [task, BARS[name], *(f"{bar(task, name)[key]:.3g}" for key in COLUMNS)]
         for task in NAMED_TASKS
         for name in bars_of(task)
     ]
-    print(markdown_table(["task", "navigator", "SR [%]", "SPL [%]", "steps", "return"], rows))
+    print(markdown_table(["task", "navigator", "SR [%]", "SPL [%]", "steps", "return", "CPU a step [ms]"], rows))
 
 
 if __name__ == "__main__":

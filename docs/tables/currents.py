@@ -192,3 +192,7 @@ class Mapped(Estimated):
         there = move_place(target.expand(len(place), 2), bearing, distance)
         phases, directions = numbers[3:].tensor_split([EDDIES], -1)
         return (self.rms * eddy_velocity(there, eddy_waves(directions, MOTION["eddy_km"]), phases)).float()
+
+
+CURRENT_RULES = {"offset": Offset, "estimated": Estimated, "mapped": Mapped}
+"""Rules by their names in bars.py."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import math
 import os
 import resource
 import shutil
@@ -31,7 +32,7 @@ from typing import Any, NamedTuple
 
 import magrl.interrupts  # noqa: F401 - before what takes seconds
 from agents import keep_agents, save_agent
-from bars import BARS, VEHICLES, bar, bars_of, draw_areas
+from bars import BARS, VEHICLES, bar, bars_of
 from flights import write_picture
 from magrl import score
 from magrl.checks import check_choice
@@ -49,14 +50,14 @@ import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
-from pandas import DataFrame, concat, read_csv
+from pandas import DataFrame, Series, concat, read_csv
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from tqdm import tqdm
 
-POINTS = 10
-"""Points of a learning curve."""
+POINTS, FEW = 10, 200
+"""Points of a learning curve, and their episodes."""
 SCORES = ("SR", "SPL", "return")
 """Columns of scores."""
 Row = dict[str, Any]
@@ -86,6 +87,9 @@ RECIPES: dict[str, tuple[str, ...]] = {
     "ppo_memory": ("ppo_memory.py", "--task", "TASK"),
 }
 """Recipes: file and options."""
+OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLORS = dict(zip((*ALGORITHMS, *RECIPES), OKABE_ITO, strict=False))
+"""Colors of algorithms."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +112,9 @@ class Config:
     """Folder of table, data and figure."""
 
 
-def scores_of(agent: Any, task: str) -> Row:
-    """Return the scores of an agent that a curve shows."""
-    scores = score(agent, task, episodes=VEHICLES)
+def scores_of(agent: Any, task: str, episodes: int = VEHICLES) -> Row:
+    """Return the scores of an agent that a table or a curve shows."""
+    scores = score(agent, task, episodes=episodes)
     return {key: scores[key] for key in SCORES}
 
 
@@ -121,11 +125,11 @@ class Curve(BaseCallback):
         super().__init__()
         self.task, self.steps, self.rows, self.began = task, steps, list[Row](), time.process_time()
 
-    def point(self) -> None:
+    def point(self, episodes: int = FEW) -> None:
         """Add a point."""
         paused = time.process_time()
         row = {"steps": self.num_timesteps, "cpu_s": paused - self.began}
-        self.rows.append(row | scores_of(self.model, self.task))
+        self.rows.append(row | scores_of(self.model, self.task, episodes))
         self.began += time.process_time() - paused
 
     def _on_step(self) -> bool:
@@ -141,7 +145,7 @@ def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
     model = chosen.make(BatchedVecEnv(envs), seed=seed, device="cpu", **deepcopy(chosen.settings))
     curve = Curve(task, 1000 * NAMED_TASKS[task].budget[name])
     model.learn(curve.steps, callback=curve)
-    curve.point()  # after the last update
+    curve.point(VEHICLES)  # after the last update
     save_agent(agent, model.policy, task)
     return curve.rows
 
@@ -210,25 +214,38 @@ def table(curves: DataFrame) -> str:
 
 
 def figure(curves: DataFrame) -> Figure:
-    """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
+    """Return SPL over steps and over CPU time: medians over seeds, bands from the least to the highest, and the bars.
+
+    The last point of a run, which is of the score's episodes and not of the validation tasks, is left out for recipes.
+    """
     tasks = [task for task in NAMED_TASKS if task in set(curves["task"])]
-    drawn = Figure(figsize=(10, 7.5), layout="constrained")
-    for axes, task in zip(drawn.subplots(2, 3).flat, tasks, strict=False):
+    drawn = Figure(figsize=(12, 3.6 * math.ceil(len(tasks) / 2)), layout="constrained")
+    for part, task in zip(drawn.subfigures(math.ceil(len(tasks) / 2), 2, squeeze=False).flat, tasks, strict=False):
+        both = part.subplots(1, 2, sharey=True)
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
-            points = runs.assign(point=runs.groupby("seed").cumcount()).groupby("point")
-            steps, spl = points["steps"].median(), points["SPL"]
-            color = f"C{[*ALGORITHMS, *RECIPES].index(name)}"
-            axes.plot(steps, spl.median(), color=color, label=name)
-            axes.fill_between(steps, spl.min(), spl.max(), color=color, alpha=0.2, lw=0)
-        for name, style in zip(bars_of(task)[:0:-1], ("-", "--", ":", "-.", (0, (1, 4))), strict=False):  # oracle first
-            axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
-        axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
-        axes.legend(fontsize="xx-small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
-    if len(tasks) < len(drawn.axes):
-        draw_areas(drawn.axes[len(tasks)])
-    for axes in drawn.axes[len(tasks) + 1 :]:
-        axes.remove()
+            points = runs.assign(point=runs.groupby("seed").cumcount(), cpu=cpu_minutes(runs)).groupby("point")
+            kept = slice(None, -1 if name in RECIPES else None)
+            spl = points["SPL"]
+            for axes, along in zip(both, (points["steps"], points["cpu"]), strict=True):
+                axes.plot(along.median()[kept], spl.median()[kept], color=COLORS[name], label=name)
+                band = along.median()[kept], spl.min()[kept], spl.max()[kept]
+                axes.fill_between(*band, color=COLORS[name], alpha=0.2, lw=0)
+        styles = ("-", "--", ":", "-.", (0, (1, 4)), (0, (5, 5)), (0, (8, 2)))
+        for name, style in zip(bars_of(task)[::-1], styles, strict=False):  # oracle first
+            for axes in both:
+                axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
+        for axes, text in zip(both, ("steps", "CPU time [min]"), strict=True):
+            axes.set(xscale="log", xlabel=text, ylim=(0, 102))
+        both[0].set_ylabel("SPL [%]")
+        part.suptitle(task)
+        part.legend(*both[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
     return drawn
+
+
+def cpu_minutes(runs: DataFrame) -> Series:
+    """Return the CPU time of each point [min]; of a recipe, which states the whole, in proportion to its steps."""
+    last = runs.groupby("seed")[["steps", "cpu_s"]].transform("last")
+    return (runs["cpu_s"].fillna(last["cpu_s"] * runs["steps"] / last["steps"]) / 60).clip(lower=0.01)
 
 
 def main(args: Sequence[str] | None = None) -> None:
