@@ -140,12 +140,12 @@ class Around(TensorDictModuleBase):
         return ((radius + self.BESIDE_KM - beside).clamp_min(0) * (size > 0)).amax(-1)
 
 
-def flown(task: str, navigator: str, vehicles: int | None = None) -> tuple[EnvBase, TensorDictBase]:
-    """Return the environment of a task, and the first episode of each vehicle; arguments as of :func:`bar`."""
-    errors = {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
+def flown(task: str, navigator: str, vehicles: int | None = None, **options: Any) -> tuple[EnvBase, TensorDictBase]:
+    """Return the environment of a task with options, and the first episode of each vehicle; as of :func:`bar`."""
+    options |= {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
     observation = "legs" if NAMED_TASKS[task].legs else "dict"
     count = min(vehicles or VEHICLES, FEWER.get(navigator, math.inf))
-    env = NAMED_ENVS[task](count, observation=observation, scale_actions=False, seed=SEED, **errors)
+    env = NAMED_ENVS[task](count, observation=observation, scale_actions=False, seed=SEED, **options)
     rules: dict[str, Any] = {
         "detour": Detour,
         "sighted": Sighted,

@@ -231,13 +231,14 @@ def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = Fals
     return storm.replace_errors(**errors).transforms()
 
 
-def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
+def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> TransformedEnv:
     """Return the environment *Box* with no-go areas between start and destination, and a deadline of 20 steps.
 
     The straight path is blocked in most episodes, and areas are seen only from nearby: a greedy policy fails.
 
     Args:
         num_envs: vehicles in the batch.
+        discs: areas of an episode, of which the three nearest are seen.
         **options: of :func:`navigation_env`, with ``max_steps=20`` by default. Every ``observation`` ends with the
             areas in sight (:class:`~magrl.transforms.NoGoAreas`); ``"dict"`` has them as a key.
 
@@ -250,7 +251,9 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """
     check_choice(("progress", "spl"), reward=options.setdefault("reward", "progress"))
     env = navigation_env(num_envs, **{**NAMED_TASKS["nogo"].options, **options})
-    env.insert_transform(0, Compose(*task_transforms("nogo")))  # the reward reads the success that areas leave
+    env.insert_transform(
+        0, Compose(*task_transforms("nogo", NoGoAreas={"number": discs}))
+    )  # the reward reads the success that areas leave
     for last in [step for step in env.transform if "observation" in step.out_keys][-1:]:
         parts = last.in_keys if isinstance(last, CatTensors) else ["observation_without_areas"]
         if not isinstance(last, CatTensors):

@@ -14,7 +14,7 @@ from magrl.checks import check_type, printable, short
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import NAVIGATORS, Anywhere, Memory, Navigator
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.network import policy_content
+from magrl.tracking.network import policy_content, pretrained
 
 
 class Agent(NamedTuple):
@@ -35,7 +35,10 @@ class Agent(NamedTuple):
 Kind = Agent | type[Navigator]
 _GUIDED = Agent("gg_td3", "Gradient-Guided TD3", "Gradient-Guided TD3", "the region")
 _PLAIN = Agent("td3", "TD3", "TD3", "the region")
-KINDS: dict[str, Kind] = {"gg_td3": _GUIDED, "td3": _PLAIN, **NAVIGATORS}
+_EDDIES = Agent("eddies", "eddies (TD3)", "eddies (TD3)", "eddies in the paper's region", "a map of the field")
+PRETRAINED = {"eddies": _EDDIES}
+"""Agents that ship as files of :func:`magrl.save_policy`, by name."""
+KINDS: dict[str, Kind] = {"gg_td3": _GUIDED, "td3": _PLAIN, **NAVIGATORS, **PRETRAINED}
 """What navigators are, by their names in results: the paper's agents, and navigators that commands name."""
 
 
@@ -71,11 +74,14 @@ def named(text: str) -> Named:
     check_type(str, text=text)
     if text in NAVIGATORS:
         return Named(NAVIGATORS[text])
+    if text in PRETRAINED:
+        return Named(PRETRAINED[text], file := pretrained(text), file)
     label, _, path = ("", "", text) if _exists(text) or "=" not in text else text.partition("=")
     if label in KINDS:
         raise ValueError(f"{short(text)}: the name {label} follows from a file: leave it out, or choose another label")
+    known = (*NAVIGATORS, *PRETRAINED)
     if path == text and not (_exists(path) or "/" in path or path.endswith((".safetensors", ".onnx"))):
-        raise ValueError(f"unknown navigator {short(text)}: choose from {', '.join(NAVIGATORS)}, or [LABEL=]PATH")
+        raise ValueError(f"unknown navigator {short(text)}: choose from {', '.join(known)}, or [LABEL=]PATH")
     kind = _kind_of(file := policy_file(path))
     if label:
         kind = Agent(label, label, label, kind.trained_on, kind.needs)

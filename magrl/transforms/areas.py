@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.data import Bounded, Composite
 
+from magrl.checks import check_number
 from magrl.counters import stream_uniform
 from magrl.geodesy import move_place, polar
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
@@ -16,7 +19,7 @@ from magrl.transforms.errors.base import Episode, EpisodeNumbers
 ALONG, ACROSS_KM = (0.2, 0.8), 80.0
 """Centers lie at this share of the displacement from the destination to the start, and up to so far beside it [km]."""
 NUMBER, SEEN = 4, 3
-"""Discs of an episode, and those that are observed at once, nearest first."""
+"""Discs of an episode by default, and those that are observed at once, nearest first."""
 RADIUS_KM, SIGHT_KM = (15.0, 40.0), 75.0
 """Lowest and highest radius, and the distance from the edge within which a disc is seen [km]; chosen."""
 
@@ -29,6 +32,7 @@ class NoGoAreas(EpisodeNumbers):
     A radius is at most two thirds of the distance from a center to either end of a task.
 
     Args:
+        number: discs of an episode.
         **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`. The
             keys read are the true displacement ``(..., 2)`` in the frame of the vehicle [km], heading ``(..., 1)``
             [rad], and the flags ``success``, ``terminated``, ``truncated`` and ``done`` ``(..., 1)``, which are also
@@ -50,7 +54,11 @@ class NoGoAreas(EpisodeNumbers):
     numbers_key, stream_key = "no_go_areas", "no_go_stream"
     default_in_keys = ("true_way", "heading", "success", "terminated", "truncated", "done")
     default_out_keys = ("areas",)
-    size = 3 * NUMBER + 2
+
+    def __init__(self, number: int = NUMBER, **options: Any) -> None:
+        super().__init__(**options)
+        check_number(1, 100, whole=True, number=number)
+        self.number, self.size = number, 3 * number + 2
 
     @staticmethod
     def discs(numbers: Tensor) -> tuple[Tensor, Tensor]:
@@ -77,7 +85,7 @@ class NoGoAreas(EpisodeNumbers):
 
     def _placed(self, uniform: Tensor, start: Tensor) -> Tensor:
         """Return the discs of an episode that begins at ``start`` ``(..., 2)`` [km], and that place."""
-        share, across, radius = uniform[..., :-2].unflatten(-1, (NUMBER, 3)).unbind(-1)
+        share, across, radius = uniform[..., :-2].unflatten(-1, (self.number, 3)).unbind(-1)
         low, high = ALONG
         along, beside = (low + (high - low) * share).unsqueeze(-1), ACROSS_KM * (2 * across - 1).unsqueeze(-1)
         right = torch.stack((-start[..., 1], start[..., 0]), -1) / start.norm(dim=-1, keepdim=True).clamp_min(1e-6)
@@ -90,12 +98,13 @@ class NoGoAreas(EpisodeNumbers):
     def _seen(self, relative: Tensor, radii: Tensor, heading: Tensor) -> Tensor:
         """Return what is observed of discs at ``relative`` ``(..., number, 2)`` from the vehicle."""
         distance = relative.norm(dim=-1)
-        gap_km, nearest = (distance - radii).topk(SEEN, largest=False)
+        gap_km, nearest = (distance - radii).topk(min(SEEN, radii.shape[-1]), largest=False)
         ahead = turned(relative, -heading.unsqueeze(-2)) / distance.clamp_min(1e-6).unsqueeze(-1)
         ahead = ahead.take_along_dim(nearest.unsqueeze(-1), -2)
         closeness = (1 - gap_km.clamp_min(0) / SIGHT_KM).clamp_min(0).unsqueeze(-1)
         size = (radii.gather(-1, nearest) / RADIUS_KM[1]).unsqueeze(-1) * (closeness > 0)
-        return torch.cat((closeness * ahead, size), -1).flatten(-2).clamp(-1, 1)
+        seen = torch.cat((closeness * ahead, size), -1).flatten(-2).clamp(-1, 1)
+        return pad(seen, (0, 3 * SEEN - seen.shape[-1]))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what is observed, in [-1, 1], and the state."""

@@ -1,0 +1,58 @@
+"""Make the ladder of the named tasks: the same agents where a task is easier or harder.
+
+python docs/tables/ladder.py    # docs/results/ladder.md; some minutes
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import magrl.interrupts  # noqa: F401 - before what takes seconds
+from bars import BARS, flown
+from magrl.envs.navigation import storm_errors
+from magrl.evaluation.scores import scored
+from magrl.evaluation.tables import markdown_table
+from magrl.field.records import weather_record
+from magrl.files import write_text
+from magrl.training import command
+
+import tyro
+from tqdm import tqdm
+
+NOGO = "docs/results/agents/nogo-TD3-magrl.safetensors"
+STORM = weather_record("college")
+COLUMNS = ("easier", "the named task", "harder", "with noise")
+LEVELS: Mapping[str, list[dict[str, Any]]] = {
+    "eddies": [{"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)] + [{"noise": (0.02, 0.02, 2.0)}],
+    "nogo": [{"discs": number} for number in (2, 4, 8)],
+    "storm": [{"transforms": storm_errors(replace(STORM, variation=x * STORM.variation))} for x in (0.5, 1.0, 2.0)],
+}
+"""Options of each level."""
+AGENTS: Mapping[str, tuple[str, ...]] = {
+    "eddies": ("eddies", "parallel", "geodesic", "mapped"),
+    "nogo": (NOGO, "around", "detour"),
+    "storm": ("memory", "kalman", "secant"),
+}
+
+
+def main(out: Path = Path("docs/results/ladder.md"), vehicles: int = 1000) -> None:
+    """Fly all agents on all levels, and write the table.
+
+    Args:
+        out: File of the table, which is replaced.
+        vehicles: Number of episodes.
+    """
+    rows = []
+    for task, agent in tqdm([(task, agent) for task, agents in AGENTS.items() for agent in agents]):
+        scores = [scored(flown(task, agent, vehicles, **options)[1]) for options in LEVELS[task]]
+        cells = [f"{score['SR']:.1f} / {score['SPL']:.1f}" for score in scores]
+        label = BARS.get(agent, Path(agent).stem.partition("-")[2] or agent)
+        rows.append([task, label, *cells, *["—"] * (len(COLUMNS) - len(cells))])
+    write_text(out, markdown_table(["task", "agent", *COLUMNS], rows) + "\n")
+
+
+if __name__ == "__main__":
+    command("ladder.py", lambda: tyro.cli(main, prog="ladder.py", description=__doc__))
