@@ -141,9 +141,9 @@ PRESETS = {"fast": Config(distance_cost=0.1), "paper": PAPER}
 PRESETS["td3-fast"] = Config(preset="td3-fast", guided=False)
 NAMED = {"guided": False, "distance_cost": 0.1, "final_exploration_noise": 0.05}
 NOGO = {"learning_rate": 1.5e-3, "final_learning_rate": 2e-5, "tau": 0.03, "updates_per_batch": 24, "batch_size": 256}
-NOGO |= {"policy_noise": 0.05, "noise_clip": 0.15, "total_frames": 563_200}
+NOGO |= {"policy_noise": 0.05, "noise_clip": 0.15, "total_frames": 716_800}
 EDDIES = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "updates_per_batch": 16, "batch_size": 512}
-EDDIES |= {"exploration_noise": 0.3, "noise_clip": 0.3, "total_frames": 250_112, "gamma": 0.95, "time_limit_ends": True}
+EDDIES |= {"exploration_noise": 0.3, "noise_clip": 0.3, "total_frames": 284_928, "gamma": 0.95, "time_limit_ends": True}
 EDDIES |= {"num_envs": 256, "num_cells": (256, 256), "init_random_frames": 5120, "eval_every": 80}
 PRESETS |= {name: Config(preset=name, task=name, **NAMED, **own) for name, own in (("nogo", NOGO), ("eddies", EDDIES))}
 PRESETS["td3-paper"] = PAPER.replace(preset="td3-paper", guided=False)

@@ -5,10 +5,9 @@ python docs/tables/ladder.py    # docs/results/ladder.md; some minutes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import magrl.interrupts  # noqa: F401 - before what takes seconds
 from bars import BARS, flown
@@ -25,17 +24,24 @@ from tqdm import tqdm
 NOGO = "docs/results/agents/nogo-TD3-magrl.safetensors"
 STORM = weather_record("college")
 COLUMNS = ("easier", "the named task", "harder", "with noise")
-LEVELS: Mapping[str, list[dict[str, Any]]] = {
-    "eddies": [{"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)] + [{"noise": (0.02, 0.02, 2.0)}],
-    "nogo": [{"discs": number} for number in (2, 4, 8)],
-    "storm": [{"transforms": storm_errors(replace(STORM, variation=x * STORM.variation))} for x in (0.5, 1.0, 2.0)],
-}
-"""Options of each level."""
-AGENTS: Mapping[str, tuple[str, ...]] = {
-    "eddies": ("eddies", "parallel", "geodesic", "mapped"),
-    "nogo": (NOGO, "around", "detour"),
-    "storm": ("memory", "kalman", "secant"),
-}
+
+
+class Ladder(NamedTuple):
+    """A task, the agents that fly it, and the options of each level."""
+
+    task: str
+    agents: tuple[str, ...]
+    levels: list[dict[str, Any]]
+
+
+EDDIES = [*({"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)), {"noise": (0.02, 0.02, 2.0)}]
+DISCS = [{"discs": number} for number in (2, 4, 8)]
+STORMS = [{"transforms": storm_errors(replace(STORM, variation=x * STORM.variation))} for x in (0.5, 1.0, 2.0)]
+LADDERS = (
+    Ladder("eddies", ("eddies", "parallel", "geodesic", "mapped"), EDDIES),
+    Ladder("nogo", (NOGO, "around", "detour"), DISCS),
+    Ladder("storm", ("memory", "kalman", "secant"), STORMS),
+)
 
 
 def main(out: Path = Path("docs/results/ladder.md"), vehicles: int = 1000) -> None:
@@ -46,8 +52,8 @@ def main(out: Path = Path("docs/results/ladder.md"), vehicles: int = 1000) -> No
         vehicles: Number of episodes.
     """
     rows = []
-    for task, agent in tqdm([(task, agent) for task, agents in AGENTS.items() for agent in agents]):
-        scores = [scored(flown(task, agent, vehicles, **options)[1]) for options in LEVELS[task]]
+    for (task, _, levels), agent in tqdm([(ladder, agent) for ladder in LADDERS for agent in ladder.agents]):
+        scores = [scored(flown(task, agent, vehicles, **options)[1]) for options in levels]
         cells = [f"{score['SR']:.1f} / {score['SPL']:.1f}" for score in scores]
         label = BARS.get(agent, Path(agent).stem.partition("-")[2] or agent)
         rows.append([task, label, *cells, *["—"] * (len(COLUMNS) - len(cells))])

@@ -1,35 +1,36 @@
 """Draw the pictures of the README: an underwater vehicle in an unknown current, and an episode of each named task.
 
-    python docs/tables/pictures.py    # docs/figures/underwater.gif and task-*.png; two minutes
+    python docs/tables/pictures.py    # docs/figures/underwater.gif, eddies.png and task-*.png; three minutes
 
-The flights of the animation are those of the listing "Simulate your vehicle" of docs/vehicles.md: 100 tasks by dead
-reckoning and by kalman, of which it shows one that dead reckoning misses.
+The flights of the animation are two cells of the table known-1200: 300 tasks by dead reckoning and by kalman, which has
+elements measured at the destination and declares at once, of which it shows one that dead reckoning misses.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import magrl.interrupts  # noqa: F401 - before what takes seconds
-from magrl import earth_scenario
 from magrl.envs import Region
+from magrl.envs.navigation import task_transforms
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
-from magrl.evaluation import Flight, episode_measures, evaluation_rollout
+from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.maps import LAND, coastlines, way_ellipse
 from magrl.field import IGRF, FieldModel
 from magrl.field.elements import UNITS
-from magrl.files import write_with
+from magrl.files import read_text, write_with
 from magrl.geodesy import geodesic
 from magrl.registry import NAMED_TASKS
 from magrl.training import command
-from magrl.transforms import CONDITIONS
 from magrl.transforms.areas import outlines
+from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
 
 import numpy as np
 import torch
@@ -38,25 +39,26 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
 from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent))
 from bars import flown
-from flights import believed_places
+from flights import Flights, believed_places
 
-SHOWN, WITHIN_KM = 44, 25.0
+SHOWN, WITHIN_KM = 20, 25.0
 """Task of the animation, chosen because a coast is in sight, and the radius of arrival."""
 FIELD = IGRF("2025-01-01")
-GRAY, BLUE = "#707070", "#0072B2"
+GRAY, BLUE, VERMILION = "#707070", "#0072B2", "#D55E00"
 KM_PER_DEG, ROOM_KM = 111.2, 30.0
-COUNTER = ((0.63, "black"), (0.65, GRAY), (0.785, "black"), (0.82, BLUE))
+COUNTER = ((0.63, "black"), (0.65, GRAY), (0.795, "black"), (0.825, BLUE))
 """Place and color of each part of the counter."""
-PIECE_KM, FRAME_MS, LAST_MS = 6.0, 120, 3000
-"""Longest distance between two frames, and their durations."""
-COLORS, VEHICLES = 256, 16
-"""Colors of a map, vehicles of a rollout."""
+PIECE_KM, FRAME_MS, LAST_MS, SCALE_KM = 30.0, 120, 3000, 200.0
+"""Longest distance between two frames, their durations, and the scale bar [km]."""
+COLORS, VEHICLES, EDDY_EPISODE = 256, 16, 4
+"""Colors of a map, vehicles of a rollout, episode of *Eddies*, in which the true bearing fails."""
 
 
 class Trip(NamedTuple):
@@ -91,18 +93,17 @@ class Trip(NamedTuple):
         )
 
 
-def trips() -> tuple[Tensor, dict[str, tuple[Trip, int]]]:
-    """Return the destination of the task that is shown, and trip and number of arrivals of each navigator."""
-    scenario = earth_scenario(64, seed=0, distance_range_km=(300.0, 500.0), max_move_km=90.0)  # room for the current
-    scenario = scenario.replace(max_move_km=50.0, max_steps=120, arrival="declared", start_heading="random")
-    scenario = scenario.with_tasks(scenario.random_tasks(100, seed=0))
-    auv, made = CONDITIONS["underwater"].replace_errors(north={"constant_deg": 0.5}), {}
-    for name, belief in (("dead_reckoning", "compass and log"), ("kalman", "and IGRF-13")):
-        flight = Flight(scenario, errors=auv, model="IGRF-13", start_km=5.0, confidence=0.8)
+def trips(shown: int = SHOWN) -> tuple[Tensor, dict[str, tuple[Trip, float]]]:
+    """Return the destination of the task that is shown, and trip and arrivals [%] of each navigator."""
+    table = tomllib.loads(read_text(Path(__file__).with_name("tables.toml")))["known-1200"]
+    far = Flights.of(**{key: table[key] for key in table if key not in ("kind", "measures", "navigators", "against")})
+    made, known = {}, {"model": "IGRF-13", "start_km": 5.0}
+    for name, belief, std in (("dead_reckoning", "compass and log", None), ("kalman", "and IGRF-13", far.target_std)):
+        flight = far.flight(far.errors["underwater"], **known, confidence=0.0, target_std=std)
         navigator = flight.navigator(name)
         steps = evaluation_rollout(flight.env_of(navigator, track=True), navigator)
-        made[name] = Trip.of(steps[SHOWN], belief), int(episode_measures(steps)["success"].sum())
-    return steps[SHOWN, 0]["target_position"].double(), made
+        made[name] = Trip.of(steps[shown], belief), 100 * episode_measures(steps)["success"].double().mean().item()
+    return steps[shown, 0]["target_position"].double(), made
 
 
 class Animation:
@@ -119,9 +120,10 @@ class Animation:
         self.figure = Figure(figsize=(7.2, 7.4), dpi=100)
         axes = self.figure.add_axes((0.01, 0.13, 0.98, 0.79))
         draw_map(axes, FIELD, torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None])))
+        draw_scale(axes)
         circle = way_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
         axes.plot(*circle.T.flip(0), color=TARGET, lw=2.5)
-        axes.plot(*target.flip(-1)[:, None], "^", color=TARGET, ms=13, zorder=3)
+        axes.plot(*target.flip(-1)[:, None], "^", color=TARGET, ms=8, zorder=3)
         (self.ellipse,) = axes.fill([0], [0], fc=(*to_rgb(BLUE), 0.25), ec=BLUE, lw=2, label="its estimate, 2σ")
         self.lines = [
             axes.plot([], [], style, color=color, lw=3, ms=9, mew=2.5, mfc=fill, markevery=[-1], label=label)[0]
@@ -151,7 +153,7 @@ class Animation:
             text.set_text(content)
         if verdict:
             box = {"facecolor": "white", "edgecolor": BLUE, "lw": 2, "pad": 16}
-            self.figure.text(0.5, 0.74, verdict, fontsize=27, ha="center", va="center", linespacing=1.6, bbox=box)
+            self.figure.text(0.42, 0.6, verdict, fontsize=27, ha="center", va="center", linespacing=1.6, bbox=box)
         return image_of(self.figure)
 
     def frames(self, verdict: str) -> Iterator[Image.Image]:
@@ -191,6 +193,18 @@ def draw_map(axes: Axes, field: FieldModel, places: Tensor, *, coast: bool = Tru
     axes.set(xlim=box.longitude, ylim=box.latitude, xticks=[], yticks=[])
 
 
+def draw_scale(axes: Axes) -> None:
+    """Draw a scale bar and the direction of north in a corner of a map."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    here = south + 0.04 * (north - south)
+    bar = SCALE_KM / KM_PER_DEG / math.cos(math.radians(here))
+    left = east - 0.04 * (east - west) - bar
+    axes.plot([left, left + bar], [here, here], color="black", lw=4)
+    axes.text(left + bar / 2, here + 0.012 * (north - south), f"{SCALE_KM:.0f} km", fontsize=17, ha="center")
+    arrow = {"arrowstyle": "<-", "lw": 2.5}
+    axes.annotate("N", (0.06, 0.82), (0.06, 0.94), "axes fraction", arrowprops=arrow, fontsize=19, ha="center")
+
+
 def task_picture(task: str) -> Figure:
     """Return a map of an episode, or on *Storm* the errors of its readings."""
     navigator, episode = NAMED_TASKS[task].picture
@@ -208,12 +222,50 @@ def task_picture(task: str) -> Figure:
     areas = steps.get("no_go_areas", None)
     rings = path.new_empty(0, 1, 2) if areas is None else outlines(areas[0], target[0])
     draw_map(axes, field, torch.cat((path, target, rings.flatten(0, 1))), coast=len(env.region) == 1)
+    if (numbers := steps.get("motion_error", None)) is not None:
+        corners = (torch.tensor((*axes.get_ylim(), *axes.get_xlim())).reshape(2, 2).T).double()
+        draw_currents(axes, numbers[0].double(), *corners)
     for ring in rings:
         axes.fill(*ring.T.flip(0), color=AREA, alpha=0.5)
     axes.plot(*path.T.flip(0), ".-", color=BLUE, lw=2, ms=8)
     axes.plot(*path[0].flip(0)[:, None], "s", color=START, ms=9)
     axes.plot(*target.T.flip(0), "^", color=TARGET, ms=10)
     return figure
+
+
+def eddies_picture(episode: int = EDDY_EPISODE) -> Figure:
+    """Return two vehicles in an episode of *Eddies*, over its currents: by the true bearing, and the trained agent."""
+    figure = Figure(figsize=(7, 5), dpi=100, layout="constrained")
+    axes, paths = figure.subplots(), []
+    for name, label, color in (("geodesic", "true bearing", VERMILION), ("eddies", "trained agent", BLUE)):
+        steps = flown("eddies", name, VEHICLES)[1][episode]
+        steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
+        paths.append(torch.cat((steps["position"][:1], steps["next", "position"])).double())
+        end = "arrives" if steps["next", "success"][-1].item() else "does not arrive"
+        spent = f"{label}: {end}, {steps['next', 'move'][:, 0].sum():.0f} km through the water"
+        axes.plot(*paths[-1].T.flip(0), "o-", color=color, lw=2, ms=4, label=spent)
+    target = steps["target_position"][0].double()
+    shown = torch.cat([*paths, target[None]])
+    arrows = draw_currents(axes, steps["motion_error"][0].double(), shown.amin(0) - 0.6, shown.amax(0) + 0.6)
+    axes.quiverkey(arrows, 0.85, 1.04, 1.0, "1 km/h", labelpos="E")
+    axes.set_title("currents, which the vehicles do not know", loc="left", fontsize=10)
+    axes.plot(*paths[0][0].flip(0)[:, None], "s", color="black", ms=8, label="start")
+    circle = way_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
+    axes.plot(*circle.T.flip(0), color=TARGET, lw=2, label="destination, within 25 km")
+    axes.set(xlabel="longitude [°]", ylabel="latitude [°]", aspect=1 / math.cos(math.radians(target[0])))
+    figure.legend(loc="outside lower center", fontsize=10, ncols=2)
+    return figure
+
+
+def draw_currents(axes: Axes, numbers: Tensor, low: Tensor, high: Tensor) -> Quiver:
+    """Draw and return the currents of an episode of *Eddies* between two corners ``(2,)`` [deg]."""
+    ends = zip(low.tolist(), high.tolist(), strict=True)
+    latitude, longitude = (torch.linspace(*pair, 18, dtype=torch.float64) for pair in ends)
+    places = torch.cartesian_prod(latitude, longitude)
+    phases, directions = numbers[3:].tensor_split([EDDIES], -1)
+    motion = task_transforms("eddies")[0]
+    north, east = (motion.eddies_km_h * eddy_velocity(places, eddy_waves(directions, motion.eddy_km), phases)).T
+    return axes.quiver(*places.T.flip(0), east, north, color=AREA, width=0.003, scale=25)
 
 
 def draw_errors(figure: Figure, errors: Tensor) -> None:
@@ -244,8 +296,11 @@ def main(out: Path = Path("docs/figures")) -> None:
     """
     target, flights = trips()
     (reckoning, few), (filtered, many) = flights.values()
-    frames = Animation(target, reckoning, filtered).frames(f"dead reckoning {few} of 100,\nmagrl {many} of 100 arrive")
+    frames = Animation(target, reckoning, filtered).frames(
+        f"dead reckoning {few:.0f} of 100,\nmagrl {many:.0f} of 100 arrive"
+    )
     save_gif(out / "underwater.gif", list(frames))
+    write_with(out / "eddies.png", partial(image_of(eddies_picture()).quantize(COLORS).save, format="PNG"))
     for task in NAMED_TASKS:
         picture = image_of(task_picture(task)).quantize(COLORS)
         write_with(out / f"task-{task}.png", partial(picture.save, format="PNG"))

@@ -11,7 +11,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 
 from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.evaluation.navigators import KINDS, check_distinct, make_navigator, named, training_settings
+from magrl.evaluation.navigators import KINDS, PRETRAINED, check_distinct, make_navigator, named, training_settings
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import NAVIGATORS, Anywhere, policy_env
 from magrl.navigators.quasi_newton import probe_length
@@ -44,7 +44,7 @@ def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv) -> None:
-    assert NAVIGATOR_COLORS.keys() == KINDS.keys() == {"gg_td3", "td3", *NAVIGATORS}
+    assert NAVIGATOR_COLORS.keys() == KINDS.keys() == {"gg_td3", "td3", *NAVIGATORS, *PRETRAINED}
     assert len(set(NAVIGATOR_COLORS.values())) == len(NAVIGATOR_COLORS)
     for name, kind in KINDS.items():
         assert kind.name == name

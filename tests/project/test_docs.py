@@ -291,17 +291,6 @@ def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> Non
         assert trained == " ".join(max(runs, key=lambda run: float(run[1])))
 
 
-def test_vehicles_of_the_readme_have_the_intervals_of_their_episodes() -> None:
-    episodes, page = read_episodes(ROOT / "docs/results/known.csv.gz"), TEXTS[ROOT / "README.md"]
-    for navigator, cells in rows("## Results", "navigator (given)", page).items():
-        for level, cell in zip(("ship", "underwater", "low-cost"), cells, strict=True):
-            some = episodes[(episodes["navigator"] == navigator) & (episodes["level"] == level)]
-            right, wrong = (100 * torch.tensor(some[name].to_numpy()).double() for name in ("success", "false_arrival"))
-            region = torch.tensor(some["region"].to_numpy())
-            shares = ("{:.1f} ± {:.1f}".format(*flights.clustered(values, region)) for values in (right, wrong))
-            assert cell == " / ".join(shares), (navigator, level)
-
-
 @pytest.mark.parametrize("name", NAMED_TASKS)
 def test_a_named_task_is_a_function_a_row_and_a_section(name: str, monkeypatch) -> None:
     """The page has its id, steps and arrival, and lists its observation by index, or names the task with the same."""
