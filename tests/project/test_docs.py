@@ -10,6 +10,7 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import sys
 from functools import cache
 from itertools import chain
@@ -126,6 +127,8 @@ def reader(tmp_path_factory) -> Path:
     policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
     save_policy(folder / "runs" / "first" / "policy.safetensors", policy)
     write_px4_flight(folder)
+    (folder / "docs" / "examples").mkdir(parents=True)
+    shutil.copy(ROOT / "docs/examples/log.csv", folder / "docs/examples")
     return folder
 
 
