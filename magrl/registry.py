@@ -24,7 +24,7 @@ class NamedTask(NamedTuple):
         transforms: classes in :mod:`magrl.transforms` that change the episode, with their options, before the reward;
             with them, ``"base"`` is no reward.
         options: options of the environment that it changes.
-        legs: whether an agent observes its last legs, by a map, in place of the readings.
+        legs: whether an agent observes its last legs, by a map, instead of the readings.
 
     Example:
         >>> NAMED_TASKS["nogo"].id, NAMED_TASKS["box"].id

@@ -53,7 +53,7 @@ class GeomagneticNavEnv(EnvBase):
         proximity_weight: reward per unit of the objective, zeta_2.
         objective_limit: upper bound on the objective in that reward; None, as in the paper.
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
-        seed: seed of tasks and start headings; a random one of those for trainings if None.
+        seed: seed of tasks and start headings; by default a random training seed.
         device: device of the batch.
         **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``.
 
