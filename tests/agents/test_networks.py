@@ -7,8 +7,10 @@ import torch
 from tensordict import TensorDict
 
 from magrl.agents import make_actor
-from magrl.agents.networks import CorrectedMove
+from magrl.agents.networks import AreaGeometry, CorrectedMove
 from magrl.tracking import Rules
+from magrl.transforms import NoGoAreas
+from magrl.transforms.areas import distance_km
 
 
 def test_new_actor_is_not_saturated() -> None:
@@ -34,3 +36,27 @@ def test_bad_sizes_are_refused() -> None:
     for size, cells in ((0, (8,)), (13, (0,)), (13, (1.5,)), (13, (10**9,))):
         with pytest.raises(ValueError, match="must be a whole number from 1 up to 65536"):
             make_actor(size, cells)
+
+
+def test_the_geometry_of_areas_is_that_of_their_discs() -> None:
+    """Bearings of center and edges, and by how much a leg clears each disc, from the observation alone."""
+    generator = torch.Generator().manual_seed(0)
+    centers = 60 + 100 * torch.rand(50, 4, 2, generator=generator)
+    radii = 15 + 25 * torch.rand(50, 4, generator=generator)
+    seen = NoGoAreas()._seen(centers, radii, torch.zeros(50, 1))
+    action = 2 * torch.rand(50, 2, generator=generator) - 1
+    features = AreaGeometry()(torch.cat((torch.zeros(50, 13), seen, action), -1))
+    order = (centers.norm(dim=-1) - radii).argsort(-1)[:, :3]
+    center, radius = centers.take_along_dim(order.unsqueeze(-1), -2), radii.gather(-1, order)
+    there = seen.unflatten(-1, (3, 3))[..., 2] > 0
+    bearing, half = torch.atan2(center[..., 1], center[..., 0]), torch.asin(radius / center.norm(dim=-1))
+    expected = torch.stack((half, bearing - half, bearing + half), -1) / (math.pi / 2)
+    about = features[:, 28:46].unflatten(-1, (3, 6))
+    torch.testing.assert_close(about[there][:, 3:], expected[there], atol=1e-4, rtol=0)
+    assert (about[~there] == 0).all()
+    turn, length = action[:, 1:] * math.pi / 2, 25 * (action[:, :1] + 1)
+    end = length * torch.cat((torch.cos(turn), torch.sin(turn)), -1)
+    clear = (distance_km(center, torch.zeros(50, 2), end) - radius) / 20
+    torch.testing.assert_close(features[:, 48:51][there], clear.clamp(-1.5, 3)[there], atol=1e-3, rtol=0)
+    assert (features[:, 48:51][~there] == 3).all()
+    assert 0 < there.sum() < 150

@@ -19,8 +19,8 @@ from support.paths import with_paths
 from support.recipes import ROOT, load, small
 from tensordict import TensorDict
 
-from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, load_policy, paper
-from magrl.envs.navigation import no_go_env
+from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, load_policy, paper, planet_scenario
+from magrl.envs.navigation import eddies_env, no_go_env
 from magrl.navigators import policy_env
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
@@ -121,6 +121,22 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
     assert torch.equal(policy.observe(dicts.reset())["observation"], flat.reset()["observation"])
     with pytest.raises(ValueError, match="observes no-go areas, the environment has none: fly it in no_go_env"):
         evaluate(policy, "paper-100")
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_training_in_eddies(tmp_path: Path) -> None:
+    """Its policy gets its last legs from the map of any environment of one region, and acts as in training."""
+    options = {"total_frames": 64, "eval_every": 4, "eval_tasks": 2, "eval_tasks_small": 2}
+    recipe.train(small(recipe, tmp_path / "run", task="eddies", **options))
+    policy = load_policy(tmp_path / "run" / "policy.safetensors")
+    assert policy.view == eddies_env(seed=0).view
+    plain, own = eddies_env(8, observation="dict", scale_actions=False, seed=1), eddies_env(8, seed=1)
+    flown = policy_env(plain, policy).rollout(5, policy, break_when_any_done=False)
+    trained = own.rollout(5, policy.actor, break_when_any_done=False)
+    assert torch.equal(flown["next", "recent_legs"], trained["next", "observation"])
+    assert len(evaluate(policy, "figure-4-1", max_steps=2)) == 1
+    with pytest.raises(ValueError, match="a map is of one region, got 3"):
+        evaluate(policy, planet_scenario(3, seed=0).with_tasks(planet_scenario(3, seed=0).random_tasks(2, seed=0)))
 
 
 @pytest.mark.slow
