@@ -1,5 +1,6 @@
 """Sphinx configuration: `make docs` builds the documentation in build/docs, without network access."""
 
+import inspect
 import re
 import sys
 from collections import defaultdict
@@ -59,6 +60,16 @@ def describe(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
         lines[:] = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", name.rpartition(".")[2]), lines)
 
 
+def show_arguments(
+    app: Any, what: str, name: str, obj: Any, options: Any, signature: str | None, returned: str | None  # noqa: ARG001
+) -> tuple[str, str | None] | None:
+    """Show the arguments of a class whose metaclass, such as TorchRL's of environments, takes any."""
+    if what != "class" or signature != "(*args, **kwargs)":
+        return None
+    own = inspect.signature(obj.__init__)
+    return str(own.replace(parameters=list(own.parameters.values())[1:], return_annotation=own.empty)), returned
+
+
 WORDS = {*KEYS, "step_price"}
 """Keys and options with the name of a function, which are not linked to it."""
 
@@ -82,4 +93,5 @@ def setup(app: Any) -> None:
     """Connect the hooks of this project."""
     app.connect("source-read", add_title)
     app.connect("autodoc-process-docstring", describe, priority=600)  # after napoleon
+    app.connect("autodoc-process-signature", show_arguments)
     app.connect("doctree-resolved", link_names)
