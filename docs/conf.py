@@ -61,7 +61,13 @@ def describe(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
 
 
 def show_arguments(
-    app: Any, what: str, name: str, obj: Any, options: Any, signature: str | None, returned: str | None  # noqa: ARG001
+    app: Any,
+    what: str,
+    name: str,
+    obj: Any,
+    options: Any,
+    signature: str | None,
+    returned: str | None,  # noqa: ARG001
 ) -> tuple[str, str | None] | None:
     """Show the arguments of a class whose metaclass, such as TorchRL's of environments, takes any."""
     if what != "class" or signature != "(*args, **kwargs)":

@@ -39,6 +39,7 @@ from torchrl.envs import EnvBase
 VEHICLES, FEWER = 1000, {"estimated": 200}
 COLUMNS = ("SR", "SPL", "steps", "return", "ms")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
+BARS |= {"memory": "memory (pretrained)"}
 BARS |= {"told": "kalman, which knows the size of each error"}
 BARS |= {"around": "secant, least turn around the areas in sight"}
 BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}
