@@ -60,16 +60,9 @@ def describe(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
         lines[:] = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", name.rpartition(".")[2]), lines)
 
 
-def show_arguments(
-    app: Any,
-    what: str,
-    name: str,
-    obj: Any,
-    options: Any,
-    signature: str | None,
-    returned: str | None,  # noqa: ARG001
-) -> tuple[str, str | None] | None:
+def show_arguments(*event: Any) -> tuple[str, str | None] | None:
     """Show the arguments of a class whose metaclass, such as TorchRL's of environments, takes any."""
+    _, what, _, obj, _, signature, returned = event
     if what != "class" or signature != "(*args, **kwargs)":
         return None
     own = inspect.signature(obj.__init__)
