@@ -164,8 +164,8 @@ def pilot_of(navigator: str | Path | nn.Module) -> tuple[Rules, nn.Module | None
         navigator: ``"kalman"``, which has no network; ``"anywhere"``; a file; or a module, which is copied.
 
     Example:
-        >>> pilot_of("kalman"), pilot_of("secant")
-        ((Rules(), None), None)
+        >>> pilot_of("kalman")[1], pilot_of("secant")
+        (None, None)
     """
     rules: Any = getattr(navigator, "rules", None)
     if navigator == "kalman":

@@ -37,6 +37,7 @@ ANSWERS = {
     "magrl/GeomagneticNavigationReadings-v1": ("7902808c1ad4c6cb", 246.6715),
     "magrl/GeomagneticNavigationStorm-v1": ("f10e421c73c30559", 136.774),
     "magrl/GeomagneticNavigationNoGo-v0": ("051593964a807a0a", -6.7272),
+    "magrl/GeomagneticNavigationEddies-v0": ("524d3a2718f25782", 188.4429),
 }
 """Digest of readings and of the ends; sum of the means of observations and of the reward, each times its place."""
 FIRST, SIZE = np.array([1, 0]), np.array([25, 1.5])  # of actions in km and rad, from those in [-1, 1]

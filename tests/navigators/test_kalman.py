@@ -107,9 +107,11 @@ def test_weights_that_are_not_finite_and_missing_files_are_refused(tmp_path: Pat
 
 
 def test_every_pretrained_pilot_is_small_and_has_a_card() -> None:
-    for file in map(pretrained, ("anywhere", "memory")):
+    for file in map(pretrained, ("anywhere", "eddies", "memory")):
         assert file.stat().st_size < 1_000_000
         card = file.with_suffix(".md").read_text(encoding="utf-8")
         assert all(f"## {part}\n" in card for part in ("Training", "Data", "Limits"))
-    with pytest.raises(ValueError, match="pretrained_policy must be one of 'anywhere', 'memory', got 'nowhere'"):
+    with pytest.raises(
+        ValueError, match="pretrained_policy must be one of 'anywhere', 'eddies', 'memory', got 'nowhere'"
+    ):
         pretrained("nowhere")

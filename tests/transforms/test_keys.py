@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from support.conformance import check_one_device
+from support.environments import paper_field
 from support.errors import all_errors
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
@@ -14,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from magrl import transforms
+from magrl import Scenario, transforms
 from magrl.tracking import Rules
 from magrl.transforms import AngleVector, DeclareArrival, EpisodeSum, MinMaxNorm, TrackField
 from magrl.transforms.base import StatefulTransform
@@ -23,9 +24,11 @@ from magrl.transforms.track import READ_KEYS
 FLAGS = ("done", "terminated", "truncated")
 SIZES = {"field": 3, "target_field": 3, "move": 2, "heading": 1, "elapsed_steps": 1, "position": 2}
 SIZES |= {"target_position": 2, "start_position": 2, "true_way": 2, "highest_spl": 1, "step_price": 1}
+SIZES |= {"fix": 2, "target_fix": 2}
 SIZES |= {"gradient_heading": 1, "number": 1, "field_gradient": 6} | dict.fromkeys(("success", *FLAGS), 1)
 LEAST = {"field": (5.0, -16.0, 35000.0), "target_field": (6.0, -20.0, 35500.0), "true_way": (300.0, 100.0)}
 LEAST |= {"position": (3.0, 160.0), "target_position": (6.0, 163.0), "start_position": (2.0, 159.0)}
+LEAST |= {"fix": (3.0, 160.0), "target_fix": (6.0, 163.0)}
 
 
 class Foreign(EnvBase):
@@ -52,7 +55,7 @@ class Foreign(EnvBase):
         draw, values = torch.Generator().manual_seed(self.count), {}
         for name in self.names:
             value = torch.rand(*self.batch_size, SIZES[name], generator=draw) + torch.tensor(LEAST.get(name, 0.0))
-            values[name] = value.to(torch.float64 if "position" in name else torch.float32)
+            values[name] = value.to(torch.float64 if "position" in name or "fix" in name else torch.float32)
         flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("success", *FLAGS)}
         values |= {name: flag for name, flag in flags.items() if name in self.names}
         if "elapsed_steps" in values:
@@ -87,6 +90,7 @@ KINDS = [kind for kind in PUBLIC if issubclass(kind, Transform)]
 OPTIONS: dict[type[Transform], dict] = {
     transforms.DistanceCost: {"cost": 0.1},
     transforms.FieldGradient: {"field": waves},
+    transforms.Fix: {"field": paper_field(), "region": Scenario().edge},
     transforms.KnownPlace: {"start_km": 5.0, "target_km": 5.0},
     transforms.MagneticWeather: {"speed_km_h": 20, "span_h": 9},
     transforms.MotionError: {"log_scale": 0.1},
