@@ -20,6 +20,7 @@ import magrl.interrupts  # noqa: F401 - before what takes seconds
 from currents import CURRENT_RULES
 from magrl.envs.navigation import NAMED_ENVS, storm_errors
 from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
@@ -168,7 +169,8 @@ def bar(task: str, navigator: str) -> dict[str, float]:
     """
     began = time.process_time()
     rollout = flown(task, navigator)[1]
-    return {**scored(rollout), "ms": 1000 * (time.process_time() - began) / rollout.numel()}
+    steps = first_episode_mask(rollout["next", "done"]).sum().item()
+    return {**scored(rollout), "ms": 1000 * (time.process_time() - began) / steps}
 
 
 def bars_of(task: str) -> list[str]:

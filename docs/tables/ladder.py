@@ -38,7 +38,7 @@ EDDIES = [*({"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)), {"noise": (0.0
 DISCS = [{"discs": number} for number in (2, 4, 8)]
 STORMS = [{"transforms": storm_errors(replace(STORM, variation=x * STORM.variation))} for x in (0.5, 1.0, 2.0)]
 LADDERS = (
-    Ladder("eddies", ("eddies", "parallel", "geodesic", "mapped"), EDDIES),
+    Ladder("eddies", ("eddies", "offset", "parallel", "geodesic"), EDDIES),
     Ladder("nogo", (NOGO, "around", "detour"), DISCS),
     Ladder("storm", ("memory", "kalman", "secant"), STORMS),
 )
