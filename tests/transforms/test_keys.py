@@ -1,5 +1,6 @@
 """Keys of all transforms: other names in a foreign environment of any batch, and states that belong to one instance."""
 
+import copy
 from collections.abc import Callable
 
 import pytest
@@ -117,7 +118,7 @@ def make(kind: type[Transform], ins: list[NestedKey], outs: list[NestedKey]) -> 
         return Compose(track, DeclareArrival(RULES, in_keys=ins))
     if kind is MinMaxNorm:
         return MinMaxNorm(ins, outs, bounds={key: (-torch.ones(2), torch.ones(2)) for key in ins})
-    return kind(in_keys=ins, **({} if kind in FIXED else {"out_keys": outs}), **OPTIONS.get(kind, {}))
+    return kind(in_keys=ins, **({} if kind in FIXED else {"out_keys": outs}), **copy.deepcopy(OPTIONS.get(kind, {})))
 
 
 def other(name: str) -> NestedKey:
