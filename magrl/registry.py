@@ -101,7 +101,7 @@ _ROWS = (
         "Eddies",
         0,
         "eddies_env",
-        15.6,
+        15.4,
         budget={"PPO": 1000, "SAC": 50, "TD3": 50, "TD3-magrl": 0},
         reference="estimated",
         bars=("parallel", "offset", "estimated", "geodesic", "mapped"),
