@@ -18,7 +18,16 @@ from typing import Annotated, Literal
 
 import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import paper
-from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
+from magrl.agents import (
+    AreaGeometry,
+    FieldPolicy,
+    PolicyConfig,
+    SoftUpdate,
+    TD3Loss,
+    make_critic,
+    optimize,
+    saturation_penalty,
+)
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import guidance_pair, task_transforms, task_view
 from magrl.envs.scenario import rule_settings
@@ -211,7 +220,10 @@ def train(config: Config) -> dict[str, float]:
         env = make_env(base, view, config)
 
         # Networks
-        shape = {"layer_norm": config.layer_norm, "geometry": "areas" in view.in_keys}
+        shape = {
+            "layer_norm": config.layer_norm,
+            "geometry": "areas" in view.in_keys and view.size == AreaGeometry.SIZE,
+        }
         actor = (network := PolicyConfig(view, config.num_cells, **shape)).make_actor(env.device)
         critic = make_critic(view.size, config.num_cells, **shape, device=env.device)
 

@@ -1,5 +1,6 @@
 """Agents: networks, the TD3 losses that train them, and trained policies with their files."""
 
+from magrl.agents.networks import AreaGeometry as AreaGeometry
 from magrl.agents.networks import make_actor as make_actor
 from magrl.agents.networks import make_correcting_actor as make_correcting_actor
 from magrl.agents.networks import make_critic as make_critic
