@@ -13,7 +13,7 @@ from torchrl.data import Composite, Unbounded
 from magrl.checks import check_number
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
 from magrl.field.model import FieldModel, elements_at
-from magrl.geodesy import geodesic, move_place, polar
+from magrl.geodesy import geodesic, move_place, polar, to_ecef
 from magrl.guidance import displacement_to
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform
@@ -76,9 +76,9 @@ class Fix(ObservationTransform):
 
     def _check_map(self, elements: Tensor) -> None:
         """Raise if a place of the grid and another one have the same elements."""
-        here = self.places
-        far = geodesic(*here.unsqueeze(1).unbind(-1), *here.unbind(-1))[0]
-        second = torch.cdist(self.scaled, self.scaled).masked_fill(far < NEIGHBORS_KM, torch.inf).argmin(-1)
+        here, points = self.places, to_ecef(*self.places.unbind(-1))
+        neighbors = torch.cdist(points, points) < NEIGHBORS_KM
+        second = torch.cdist(self.scaled, self.scaled).masked_fill(neighbors, torch.inf).argmin(-1)
         found, residual = self._solved(elements, per_nanotesla(elements), here[second])
         away = geodesic(*here.unbind(-1), *found.unbind(-1))[0]
         same = (residual < ALIKE_NT) & (away > 1.0)
