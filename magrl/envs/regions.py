@@ -103,15 +103,14 @@ class Regions(Float64Module):
 
     latitude: Tensor
     longitude: Tensor
-    longest_km: Tensor
-    """Upper bound of the distances in each box, ``(K,)`` [km], tight for boxes up to a quarter of the globe."""
+    _longest_km: Tensor | None
 
     def __init__(self, latitude: Tensor, longitude: Tensor) -> None:
         super().__init__()
         latitude, longitude = checked_boxes(latitude, longitude)
         self.register_buffer("latitude", latitude, persistent=False)
         self.register_buffer("longitude", longitude, persistent=False)
-        self.register_buffer("longest_km", _longest_km(latitude, longitude), persistent=False)
+        self.register_buffer("_longest_km", None, persistent=False)
 
     @classmethod
     def of(cls, boxes: Region | Regions | Iterable[Region]) -> Regions:
@@ -129,6 +128,13 @@ class Regions(Float64Module):
         boxes = [boxes] if isinstance(boxes, Region) else boxes
         edges = torch.tensor([(*box.latitude, *box.longitude) for box in boxes], dtype=torch.float64).reshape(-1, 4)
         return cls(edges[:, :2], edges[:, 2:])
+
+    @property
+    def longest_km(self) -> Tensor:
+        """Upper bound of the distances in each box, ``(K,)`` [km], tight for boxes up to a quarter of the globe."""
+        if self._longest_km is None:
+            self._longest_km = _longest_km(self.latitude, self.longitude)
+        return self._longest_km
 
     def __len__(self) -> int:
         """Return the number of regions."""
@@ -190,7 +196,7 @@ class Regions(Float64Module):
             Regions(Region(latitude=(-15.0, 5.0), longitude=(155.0, 175.0)))
         """
         check_number(0, margin_deg=margin_deg)
-        margin = torch.full_like(self.longest_km, margin_deg)
+        margin = torch.full_like(self.latitude[:, 0], margin_deg)
         return self._grown(margin, margin)
 
     def reachable(self, max_move_km: float) -> Regions:
@@ -204,7 +210,7 @@ class Regions(Float64Module):
             Regions(Region(latitude=(-10.5, 0.5), longitude=(159.5, 170.5)))
         """
         check_number(0, max_move_km=max_move_km)
-        reach = torch.full_like(self.longest_km, math.radians(max_move_km / _SHORTEST_DEGREE_KM))
+        reach = torch.full_like(self.latitude[:, 0], math.radians(max_move_km / _SHORTEST_DEGREE_KM))
         nearest_pole = torch.deg2rad(90 - self.latitude.abs().amax(-1))
         # The farthest that a great circle of this length leads from its meridian; past a pole it leads anywhere.
         aside = torch.asin(torch.sin(reach) / torch.sin(nearest_pole)).where(reach < nearest_pole, math.pi)

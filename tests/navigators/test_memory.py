@@ -105,9 +105,10 @@ def test_actions_depend_on_the_tensordict_alone(kind: str) -> None:
         buffer = ReplayBuffer(storage=LazyTensorStorage(len(every)), batch_size=8)
         buffer.extend(every)
         torch.manual_seed(0)
-        drawn, rows = buffer.sample(), torch.randperm(len(every))
-        for batch in (drawn, every[rows], *wanted[0]):
-            for policy in (shared, policy_env(env_of(1), fresh := make()) and fresh):
+        fresh = make()
+        policy_env(env_of(1), fresh)
+        for batch in (buffer.sample(), every[torch.randperm(len(every))], wanted[0][-1]):
+            for policy in (shared, fresh):
                 again = policy(batch.exclude("action", "next"))["action"]
                 torch.testing.assert_close(again, batch["action"], rtol=1e-5, atol=1e-5)
 
