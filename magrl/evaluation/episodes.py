@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from magrl.checks import check_number, check_tensor, check_type
@@ -47,8 +47,9 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
-        What follows the end of an episode does not count. Memories, and the state and the posterior of a
-        :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are left out.
+        What follows the end of an episode does not count; a navigator flies the running episodes alone. Memories, and
+        the state and the posterior of a :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are
+        left out.
 
     Raises:
         TypeError: for another environment, or a policy that is not callable.
@@ -69,25 +70,47 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
     failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
     steps: list[TensorDictBase] = []
 
-    def act(tensordict: TensorDictBase) -> TensorDictBase:
+    def act(tensordict: TensorDictBase, rows: Tensor) -> TensorDictBase:
         action = policy(tensordict)["action"]
-        failed.logical_or_(~torch.isfinite(action.float()).all(-1, keepdim=True))
+        failed[rows] |= ~torch.isfinite(action.float()).all(-1, keepdim=True)
         if strict and failed.any():
             step = f"step {len(steps)} (the first is step 0)"
             raise ValueError(f"the agent's action is not finite: vehicles {_first(failed)} at {step}")
-        return tensordict.set("action", torch.where(failed, still, action))
+        return tensordict.set("action", torch.where(failed[rows], still[rows], action))
 
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _evaluating(policy):
-        state = env.reset()
-        while len(steps) < env.max_steps and not (steps and steps[-1]["next", "done"].all()):
-            step = env.step(act(state))
-            steps.append(step.exclude(*LARGE_KEYS))
-            state = step_mdp(step)
+        state, rows = env.reset(), torch.arange(env.num_envs, device=env.device)
+        while len(steps) < env.max_steps and len(rows):
+            step, whole = act(state, rows), len(rows) == env.num_envs
+            step = env.step(step) if whole else step.set("next", _following(env, step))
+            state, flies = step_mdp(step), ~step["next", "done"].squeeze(-1)
+            step = step.exclude(*LARGE_KEYS)
+            steps.append(step if whole else _completed(steps[-1], rows, step))
+            if isinstance(policy, Navigator) or not flies.any():  # others may expect all vehicles
+                state, rows = state[flies], rows[flies]
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():
         lost = _first(failed)
         warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=2)
     return rollout
+
+
+def _following(env: EnvBase, state: TensorDictBase) -> TensorDictBase:
+    """Return what follows a state with actions of some vehicles alone, for which TorchRL's ``step`` has no room."""
+    if not isinstance(env, TransformedEnv):
+        return env._step(state)
+    memory, given = state.get("next", None), env.transform.inv(state)
+    following = _following(env.base_env, given)
+    if memory is not None:
+        following.update(memory)
+    return env.transform._step(given, following)
+
+
+def _completed(last: TensorDictBase, rows: Tensor, step: TensorDictBase) -> TensorDictBase:
+    """Return a step of all vehicles, of which those in other rows repeat the last one."""
+    whole = last.clone()
+    whole[rows] = step
+    return whole
 
 
 @contextmanager
