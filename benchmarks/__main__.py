@@ -7,6 +7,7 @@ for the documents where --publish is given.
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib
 import platform
 import time
@@ -75,11 +76,12 @@ class Report:
             print(f"{part}: {self.content[part]}\n", flush=True)
 
     def summary(self) -> str:
-        """Return where and in how much time this was measured."""
-        machine = (
-            f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__.partition('+')[0]}"
+        """Return when, where and in how much time this was measured."""
+        threads, version = torch.get_num_threads(), torch.__version__.partition("+")[0]
+        return (
+            f"Measured on {datetime.date.today()} in {time.perf_counter() - self.began:.0f} s on {platform.machine()}, "
+            f"{threads} threads, torch {version}. Times vary between days and machines;\nratios are of calls in turn.\n"
         )
-        return f"Measured in {time.perf_counter() - self.began:.0f} s on {machine}.\n"
 
     def publish(self) -> None:
         """Write the tables and the figure of the documents; every part must have been measured."""
