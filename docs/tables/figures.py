@@ -44,10 +44,8 @@ RECIPE = "figures.py"
 FILE = Path(__file__).parent / "figures.toml"
 Figures = Mapping[str, Figure | DataFrame]
 """Figures by file, from the folder of the documentation, after the data that they are drawn from."""
-FIRST_FRAMES = 512 * 50
-"""Frames after which each of 512 vehicles has made 50 steps."""
 CURVES = {
-    "results/fig-4-2-reward": ("return", "return, mean of the last 200 episodes"),
+    "results/fig-4-2-reward": ("eval_return", "return on the validation tasks, without alignment"),
     "results/fig-4-3-success": ("eval_success_rate", "success rate on the validation tasks [%]"),
 }
 """Column and label of learning curves."""
@@ -95,17 +93,15 @@ def section_4() -> Figures:
 def learning() -> Figures:
     """Return the learning curves of the runs in figures.toml, and their data.
 
-    Returns are means over the last 200 episodes, shown from where every vehicle has ended one: before, only short
-    episodes have ended. Success rates are on the validation tasks.
+    Both are of the validation tasks, without exploration, and the return is of the terms that all agents share. Of
+    training episodes, those of all vehicles that fail end together, every 50 steps.
     """
     runs = [
         read_csv(Path(run) / "train.csv").assign(navigator=name, run=number)
         for name, pattern in declared(FILE)["learning"].items()
         for number, run in enumerate(matching(pattern))
     ]
-    data = concat(runs)[["navigator", "run", "frames", "return", "eval_success_rate"]].round(2)
-    data["return"] = data["return"].where(data["frames"] >= FIRST_FRAMES)
-    data = data.dropna(how="all", subset=["return", "eval_success_rate"])
+    data = concat(runs)[["navigator", "run", "frames", "eval_return", "eval_success_rate"]].round(2)
     return {"results/learning": data} | {file: curves(data, *shown) for file, shown in CURVES.items()}
 
 

@@ -199,6 +199,18 @@ def first_episode_mask(done: Tensor) -> Tensor:
     return done.long().cumsum(1) - done.long() == 0
 
 
+def returns(rollout: TensorDictBase) -> Tensor:
+    """Return the sum of the rewards ``(M,)`` in the first episode of each vehicle, of a rollout ``(M, T)``.
+
+    Example:
+        >>> after = TensorDict(reward=torch.ones(1, 3, 1), done=torch.tensor([[[False], [True], [True]]]))
+        >>> returns(TensorDict(next=after, batch_size=[1, 3]))
+        tensor([2.])
+    """
+    after = rollout["next"]
+    return (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1)
+
+
 def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     """Return the measures of the first episode of each vehicle.
 

@@ -19,7 +19,7 @@ from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_number, short
 from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.arrays import ArrayPolicy
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns, summarize
 from magrl.evaluation.navigators import make_navigator, named
 from magrl.navigators import Navigator
 
@@ -88,13 +88,12 @@ def flown(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
 
 def scored(rollout: TensorDictBase) -> dict[str, float]:
     """Return the score of a rollout of :func:`flown`."""
-    measures, after = episode_measures(rollout), rollout["next"]
+    measures = episode_measures(rollout)
     summary, far = summarize(measures), measures["navigation_error_km"][measures["success"]] > FAR_KM
-    earned = (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1)
     return {
         "SR": summary["success_rate"],
         **{f"SPL{end}": summary[f"spl{end}"] for end in ("", "_low", "_high")},
-        "return": earned.mean().item(),
+        "return": returns(rollout).mean().item(),
         "steps": measures["steps"].double().mean().item(),
         f"beyond_{FAR_KM}km": 100 * far.double().mean().item() if len(far) else math.nan,
     }

@@ -29,7 +29,7 @@ from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, summarize
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns, summarize
 from magrl.evaluation.flight import Flight
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere
@@ -39,8 +39,8 @@ from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunCo
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
 from magrl.training.loggers import open_log
 
-EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
-"""Measures of the validation tasks in ``train.csv``, there with the prefix ``eval_``."""
+EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
+"""Measures of the validation tasks in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
 SHARED = ("guided", "scenario", "zeta", "start_heading", "noise")
 """Settings that the file of the policy holds, for evaluations."""
 
@@ -305,8 +305,9 @@ class Run:
 
     def _evaluate(self) -> str:
         """Evaluate on the validation tasks, keep the best policy, add a row of curves; return a short report."""
-        episodes = episode_measures(evaluation_rollout(self.validation, self.policy))
-        summary = summarize(episodes)
+        rollout = evaluation_rollout(self.validation, self.policy)
+        episodes = episode_measures(rollout)
+        summary = summarize(episodes) | {"return": returns(rollout).mean().item()}
         score = selection_score(summary["spl"], episodes["success"], episodes["steps"], self.validation.max_steps)
         self.best.offer(score, self._network)
         row = self.statistics.row() | {"seconds": self.log.seconds}
