@@ -73,6 +73,8 @@ FIGURES ?= place-error section-4 learning conditions two-elements reliability
 
 tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
 	$(RUN)/python docs/tables/publish.py README.md $(wildcard docs/*.md)
+	@for table in docs/results/*.md; do made=$$(git log -1 --format=%h -- $$table); \
+	  echo "$$table is of $$made, $$(git rev-list --count $$made.. -- magrl recipes docs/tables) commits of the code ago"; done
 
 figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="place-error"; section-4 after table comparison
 

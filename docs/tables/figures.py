@@ -37,7 +37,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
 import plots
-from flights import Flights, matching, place_errors, reliability, write_picture
+from flights import Flights, clustered, matching, place_errors, reliability, write_picture
 from grid import RUNS, declared
 
 RECIPE = "figures.py"
@@ -52,13 +52,12 @@ CURVES = {
 DATA = dict.fromkeys(CURVES, "results/learning.csv")
 DATA |= dict.fromkeys(("figures/fig-4-4-trajectories", "results/fig-4-5-convergence"), "results/comparison.md")
 DATA |= {"results/fig-4-6-boxes": "results/comparison.md", "figures/conditions": "results/conditions.csv"}
-DATA["figures/reliability"] = "results/reliability.csv"
+DATA |= {f"figures/{name}": f"results/{name}.csv" for name in ("reliability", "place-error")}
 """Data of figures: the table is of the same evaluation."""
 SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
 """Navigators in the figures of Section 4."""
-PILOTS = ("anywhere", "kalman", "secant", "parallel")
-LOOKS = dict(zip(PILOTS, zip(("#0072B2", "#D55E00", "#009E73", "#000000"), "osvx", strict=True), strict=True))
-"""Color and marker of navigators in panels."""
+MARKERS = {"anywhere": "o", "kalman": "s", "secant": "v", "parallel": "x"}
+"""Navigators in panels, and their markers."""
 
 
 # From runs
@@ -118,9 +117,9 @@ def curves(data: DataFrame, column: str, label: str) -> Figure:
 
 def look(navigator: str) -> dict[str, Any]:
     """Return color, marker and label of a navigator in panels."""
-    color, marker = LOOKS[navigator]
     label = KINDS[navigator].description.partition(" (")[0]
-    return {"color": color, "marker": marker, "label": label, "ms": 4, "lw": 1.3}
+    color = plots.NAVIGATOR_COLORS[navigator]
+    return {"color": color, "marker": MARKERS[navigator], "label": label, "ms": 4, "lw": 1.3, "capsize": 2}
 
 
 def one_error(lines: str, size: object = "") -> Conditions:
@@ -131,21 +130,27 @@ def one_error(lines: str, size: object = "") -> Conditions:
         return load_conditions(path)
 
 
-def conditions(tasks: int = 200) -> Figures:
+def conditions(tasks: int = 300) -> Figures:
     """Return a panel for each error, SPL over its size for each navigator, and their data.
 
     Everything else is as at the noise alone, which is the first point of each panel.
     """
     flights, rows = Flights(["ship"], tasks=tasks), []  # its environment lets errors move vehicles
-    for navigator in tqdm(LOOKS, unit="navigator"):
-        alone = flights.summaries(navigator, one_error(""))[0]["spl"]
+    for navigator in tqdm(MARKERS, unit="navigator"):
+        alone = mean_spl(flights, navigator, one_error(""))
         for title, error in declared(FILE)["errors"].items():
-            rows.append((title, "0", navigator, alone))
+            rows.append((title, "0", navigator, *alone))
             for size in error["sizes"]:
-                spl = flights.summaries(navigator, one_error(error["lines"], size))[0]["spl"]
-                rows.append((title, f"{size}".removesuffix(".0"), navigator, spl))
-    data = DataFrame(rows, columns=["error", "size", "navigator", "spl"]).round(2)
+                spl = mean_spl(flights, navigator, one_error(error["lines"], size))
+                rows.append((title, f"{size}".removesuffix(".0"), navigator, *spl))
+    data = DataFrame(rows, columns=["error", "size", "navigator", "spl", "half_interval"]).round(2)
     return {"results/conditions": data, "figures/conditions": error_panels(data)}
+
+
+def mean_spl(flights: Flights, navigator: str, errors: Conditions) -> tuple[float, float]:
+    """Return the mean SPL [%] and the half-width of its 95 % interval, clustered by region."""
+    (episodes,) = flights.episodes(navigator, errors)
+    return clustered(100 * episodes["spl"].double(), flights.scenario.tasks.region)
 
 
 def error_panels(data: DataFrame) -> Figure:
@@ -154,7 +159,7 @@ def error_panels(data: DataFrame) -> Figure:
     *panels, last = figure.subplots(3, 4, sharey=True).flat
     for axes, (title, rows) in zip(panels, data.groupby("error", sort=False), strict=True):
         for navigator, points in rows.groupby("navigator", sort=False):
-            axes.plot(points["size"], points["spl"], **look(navigator))
+            axes.errorbar(points["size"], points["spl"], points["half_interval"], **look(navigator))
         axes.tick_params("x", labelsize=7)
         axes.set_xlabel(title, fontsize=9)
         axes.grid(alpha=0.3)
@@ -174,9 +179,9 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
     for axes, names in zip(panels, ((), ("aircraft", "ship", "underwater", "low-cost")), strict=True):
         flights = Flights(names, tasks=tasks, regions=min(tasks, 512), max_steps=80, within_km=25.0)
         axes.axline((0, 0), (100, 100), color="#808080", lw=1, ls="--")
-        for (name, errors), (color, marker) in zip(flights.errors.items(), LOOKS.values(), strict=False):
+        for (name, errors), like in zip(flights.errors.items(), MARKERS, strict=False):
             bins = reliability(flights.fly("anywhere", errors), flights.scenario.tasks.region, 25.0)
-            axes.errorbar(*zip(*bins, strict=True), color=color, marker=marker, ms=4, lw=1.2, capsize=2, label=name)
+            axes.errorbar(*zip(*bins, strict=True), **look(like) | {"label": name})
             rows += [(name, *one) for one in bins]
         axes.set_xlabel("stated probability [%]")
         axes.legend(fontsize=8)
@@ -190,11 +195,13 @@ def place_error(tasks: int = 64) -> Figures:
 
     Bands hold the middle half of the flights. Vehicles follow their dead reckoning; the start is known to 5 km.
     """
-    figure, told = Figure(figsize=(9, 3.2), layout="constrained"), {"model": "IGRF-13", "start_km": 5.0}
+    figure, rows = Figure(figsize=(9, 3.2), layout="constrained"), list[DataFrame]()
+    told = {"model": "IGRF-13", "start_km": 5.0}
     box = {"region": Region((-40, 60), (-50, 50)), "margin_deg": 10, "distance_range_km": (2950.0, 3050.0)}
     sea = Scenario(**box, field=IGRF("2025-01-01"), date="2025-01-01", start_heading="random", max_steps=80)
     sea = sea.with_tasks(sea.random_tasks(tasks, 5))
-    for axes, name in zip(figure.subplots(1, 3, sharex=True), ("ship", "underwater", "low-cost"), strict=True):
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    for axes, name in zip(panels, ("ship", "underwater", "low-cost"), strict=True):
         flight = Flight(sea, errors=name, arrival="declared", **told)
         reckoning = flight.navigator("dead_reckoning")
         flown = evaluation_rollout(flight.env_of(reckoning, track=True), reckoning)["next"]
@@ -203,11 +210,13 @@ def place_error(tasks: int = 64) -> Figures:
             path = flown["move"][..., 0].cumsum(1).nanmean(0)
             axes.plot(path, middle, color=color, label=given)
             axes.fill_between(path, low, high, color=color, alpha=0.2, lw=0)
-        axes.set(title=name, xlabel="distance flown [km]", xlim=(0, 2900), ylim=(0, None))
+            quartiles = {"distance_km": path, "lower_quartile_km": low, "median_km": middle, "upper_quartile_km": high}
+            rows.append(DataFrame(quartiles).assign(vehicle=name, by=given))
+        axes.set(title=name, xlabel="distance flown [km]", xlim=(0, 2900))
         axes.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("error of the place [km]")
+    figure.axes[0].set(ylabel="error of the place [km]", ylim=(0, None))
     figure.axes[0].legend()
-    return {"figures/place-error": figure}
+    return {"results/place-error": concat(rows).round(2), "figures/place-error": figure}
 
 
 def two_elements() -> Figures:

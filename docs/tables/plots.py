@@ -6,7 +6,6 @@ A navigator has the same color in every figure.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from typing import Any
 
 from magrl.envs import Region, Tasks
@@ -21,15 +20,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-_COLORS = ["#D55E00", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
-_COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733", "#0072B2"]
-NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
-"""Color of each navigator in every figure."""
+NAVIGATOR_COLORS = {"gg_td3": "#0072B2", "anywhere": "#0072B2", "td3": "#D55E00", "kalman": "#D55E00"}
+NAVIGATOR_COLORS |= {"secant": "#009E73", "parallel": "#000000", "ga": "#E69F00", "pso": "#56B4E9", "afsa": "#CC79A7"}
+"""Color of each navigator in every figure, of Okabe and Ito (2008); no figure has two navigators of one color."""
+_LABELED = ("#CC79A7", "#E69F00", "#56B4E9", "#999999")
+"""Colors of agents that have a label of their own, by their number in a figure."""
 
 
 def _look(name: str, index: int = 0) -> dict[str, Any]:
     """Return color and label of a navigator, given its name or a label; a label has a color by its index."""
-    return {"color": NAVIGATOR_COLORS.get(name, f"C{index}"), "label": KINDS[name].label if name in KINDS else name}
+    color = NAVIGATOR_COLORS.get(name, _LABELED[index % len(_LABELED)])
+    return {"color": color, "label": KINDS[name].label if name in KINDS else name}
 
 
 def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:

@@ -213,11 +213,13 @@ def test_reliability_counts_readings_by_their_probability() -> None:
 
 
 def test_each_error_has_a_line_for_each_navigator(monkeypatch) -> None:
-    measured = {"spl": 90.0, "steps": 10.0}
-    monkeypatch.setattr(flights.Flights, "summaries", lambda *_: [measured])
+    measured = {"spl": torch.tensor([1.0, 0.8])}
+    monkeypatch.setattr(flights.Flights, "episodes", lambda *_: [measured])
     *panels, last = figures.conditions(2)["figures/conditions"].axes
     sizes = [len(error["sizes"]) + 1 for error in grid.declared(figures.FILE)["errors"].values()]
-    assert [[len(line.get_xdata()) for line in axes.lines] for axes in panels] == [[size] * 4 for size in sizes]
+    lines = [[container.lines[0] for container in axes.containers] for axes in panels]
+    assert [[len(line.get_xdata()) for line in some] for some in lines] == [[size] * 4 for size in sizes]
+    assert lines[0][0].get_ydata()[0] == pytest.approx(90)
     assert [text.get_text() for text in last.get_legend().texts][:2] == ["anywhere", "Kalman"]
 
 
@@ -230,19 +232,19 @@ def test_the_reliability_diagram_has_a_panel_for_noise_and_one_for_vehicles(monk
 
 
 def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) -> None:
-    """Returns begin where every vehicle has ended an episode, success rates at the first evaluation."""
+    """Both are of the validation tasks."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figures, "declared", lambda _: {"learning": {"gg_td3": "runs/guided*", "td3": "runs/plain*"}})
     for run, last in (("guided", 90), ("plain-seed0", 80), ("plain-seed1", 60)):
         (tmp_path / "runs" / run).mkdir(parents=True)
-        rows = ["frames,return,eval_success_rate", "10240,200,40", f"{figures.FIRST_FRAMES},1,", f"60000,100,{last}"]
+        rows = ["frames,return,eval_return,eval_success_rate", "10240,200,9,40", f"60000,100,{last + 100},{last}"]
         (tmp_path / "runs" / run / "train.csv").write_text("\n".join(rows), encoding="utf-8")
     data, reward, success = figures.learning().values()
     assert data.groupby("navigator")["run"].nunique().to_dict() == {"gg_td3": 1, "td3": 2}
-    for figure, first in ((reward, [figures.FIRST_FRAMES, 1]), (success, [10240, 40])):
+    for figure, first, last in ((reward, 9, [190, 170]), (success, 40, [90, 70])):
         means = [line for line in figure.axes[0].lines if "seed" in line.get_label()]
-        assert [line.get_xydata()[0].tolist() for line in means] == [first, first]
-    assert [line.get_ydata()[-1] for line in means] == [90, 70]
+        assert [line.get_xydata()[0].tolist() for line in means] == [[10240, first]] * 2
+        assert [line.get_ydata()[-1] for line in means] == last
     figures.draw(("learning",), out=tmp_path)
     with Image.open(tmp_path / "results" / "fig-4-2-reward.png") as picture:
         assert picture.info["Description"] == flights.digest(tmp_path / "results" / "learning.csv")
