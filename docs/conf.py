@@ -47,8 +47,9 @@ napoleon_use_ivar = True  # attributes as fields of their class, which may also 
 napoleon_custom_sections = ["Source"]
 
 
-def add_title(app: Any, name: str, content: list[str]) -> None:  # noqa: ARG001
-    """Give a table that has a page of its own the name of its file as a title."""
+def prepare(app: Any, name: str, content: list[str]) -> None:  # noqa: ARG001
+    """Keep values and their intervals on one line; give a table that has a page of its own its file's name as title."""
+    content[0] = content[0].replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
     if name.startswith("results/"):
         content[0] = f"---\norphan: true\n---\n\n# {name.removeprefix('results/')}\n\n{content[0]}"
 
@@ -90,7 +91,7 @@ def link_names(app: Any, doctree: nodes.document, page: str) -> None:
 
 def setup(app: Any) -> None:
     """Connect the hooks of this project."""
-    app.connect("source-read", add_title)
+    app.connect("source-read", prepare)
     app.connect("autodoc-process-docstring", describe, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", show_arguments)
     app.connect("doctree-resolved", link_names)

@@ -215,6 +215,12 @@ def rows(header: str, first: str, text: str = ENVIRONMENT) -> dict[str, list[str
 
 
 @each_page
+def test_no_line_is_a_comment(page: Path) -> None:
+    """In MyST, a line that begins with a percent sign is one."""
+    assert not re.findall(r"^%.*", TEXTS[page], re.MULTILINE)
+
+
+@each_page
 def test_tables_have_a_header_and_no_hole(page: Path) -> None:
     text = re.sub(r"^( *)```.*?^\1```", "", TEXTS[page], flags=re.MULTILINE | re.DOTALL)
     for table in re.findall(r"(?:^ *\|.*\n)+", text, re.MULTILINE):
