@@ -45,6 +45,8 @@ OPTIONS = {"D": "declination", "I": "inclination", "B_H": "horizontal"}
 """Options that name the columns of the elements."""
 COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
 """Columns of what the navigator would have commanded and estimated."""
+SHORT_KM = 5.0
+"""Median length of the legs below which readings should be averaged [km]."""
 FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}", "time": "{}", "stop": "{}"}
 """Formats of the columns of log.md that do not have one decimal."""
 
@@ -213,6 +215,8 @@ def notes(table: pd.DataFrame) -> list[str]:
     if heading.abs().max() <= 2 * math.pi and heading.max() - heading.min() > 0.5:
         span = f"{heading.min():g} to {heading.max():g}"
         lines.append(f"Warning: all headings are {span} deg. If these are radians, convert them to degrees.")
+    if (length := table["distance"][1:].median()) < SHORT_KM:
+        lines.append(f"Warning: legs are {length:.2g} km long. Average readings over some 20 km, or errors add up.")
     stops = table[table["stop"] != ""]
     if len(stops):
         lines.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")

@@ -90,6 +90,7 @@ class TrainingSettings(rule_settings("zeta", "start_heading")):  # type: ignore[
     """
 
     guided: bool | None = None
+    task: str = "box"
     scenario: str | None = None
     noise: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] = (0.0, 0.0, 0.0)
 
@@ -146,6 +147,24 @@ class FieldPolicy(Navigator):
         network = isinstance(self.actor, OnnxNetwork)
         action = self.actor(observed["observation"]) if network else self.actor(observed)["action"]
         return self.act.denormalize("action", action)
+
+    def check_actor(self) -> None:
+        """Raise unless the weights of the actor are those of the configuration, from which a file makes it again.
+
+        Raises:
+            ValueError: for another network.
+        """
+        actors = self.config.make_actor("meta"), self.actor  # the first one draws no random weights
+        made, given = (
+            {name: values.shape for name, values in actor.state_dict().items() if isinstance(values, Tensor)}
+            for actor in actors
+        )
+        if made != given:
+            other = ", ".join(sorted({*made} ^ {*given}) or sorted(given))[:200]
+            raise ValueError(
+                f"the actor is not PolicyConfig.make_actor(), from which a file makes it again ({other}): "
+                "write save_policy('policy.onnx', actor, view) for a network of your own"
+            )
 
     def check_fits(self, env: EnvBase) -> None:
         """Raise unless an environment has the field of the policy, and allows its legs and turns.
@@ -243,6 +262,7 @@ def save_policy(path: Path | str, policy: nn.Module | Path | str, view: View | N
         described = {"kind": config["kind"], "view": config["view"]}
         write_atomically(Path(path), with_description(policy.actor.content, described))
         return
+    policy.check_actor()
     weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
     content = {"format": FILE_FORMAT, "config": config, "weights": weights, "training": policy.training}
     save_tensors(content, Path(path))

@@ -23,6 +23,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.measures import path_measures
+from magrl.evaluation.arrays import ArrayPolicy
 from magrl.geodesy import geodesic, wrap_angle
 from magrl.navigators import Navigator, policy_env
 from magrl.navigators.base import MEMORY
@@ -67,11 +68,14 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
     if isinstance(policy, Navigator):
         policy.check_fits(env)
     env = policy_env(env, policy)
+    own = isinstance(policy, Navigator) and not isinstance(policy, ArrayPolicy)
     failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
     steps: list[TensorDictBase] = []
 
     def act(tensordict: TensorDictBase, rows: Tensor) -> TensorDictBase:
         action = policy(tensordict)["action"]
+        if action.shape != still[rows].shape:
+            raise ValueError(f"the agent's action must be {tuple(still[rows].shape)}, got {tuple(action.shape)}")
         failed[rows] |= ~torch.isfinite(action.float()).all(-1, keepdim=True)
         if strict and failed.any():
             step = f"step {len(steps)} (the first is step 0)"
@@ -86,7 +90,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
             state, flies = step_mdp(step), ~step["next", "done"].squeeze(-1)
             step = step.exclude(*LARGE_KEYS)
             steps.append(step if whole else _completed(steps[-1], rows, step))
-            if isinstance(policy, Navigator) or not flies.any():  # others may expect all vehicles
+            if own or not flies.any():  # others may expect all vehicles
                 state, rows = state[flies], rows[flies]
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():

@@ -108,6 +108,8 @@ def _kind_of(file: Path) -> Kind:
     """Return what the file of a policy says of its agent."""
     if not _exists(str(file)):
         raise FileNotFoundError(f"there is no policy file at {printable(str(file))[:200]}")
+    if file.suffix == ".zip":
+        raise ValueError(f"{file} is a model of stable-baselines3: load it, as PPO.load(path), and pass the model")
     content = {} if file.suffix == ".onnx" else policy_content(file)
     if "rules" in content or "memory" in content:
         return Anywhere if "rules" in content else Memory
@@ -186,18 +188,22 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
         ({'zeta': 0.02}, [])
     """
     settings = {name: value for name, value in chosen.items() if value is not None}
-    fixed, others = set(settings), dict[str, list[str]]()
+    fixed, others, notes = set(settings), dict[str, list[str]](), list[str]()
     for text in texts:
         for name, value in _trained_with(text).items():
+            if name == "task":
+                notes += [f"{text} was trained for {value}, and flies other tasks here: score it there"] * (
+                    value != "box"
+                )
+                continue
             if _content(settings.setdefault(name, value)) == _content(value):
                 continue
             if name not in fixed:
                 values = f"{settings[name]} and {value} ({text})"
                 raise ValueError(f"trained with different {name}, {values}: choose with --{name.replace('_', '-')}")
             others.setdefault(name, []).append(f"{value} ({text})")
-    return settings, [
-        printable(f"{name} is {settings[name]}, in training {', '.join(other)}") for name, other in others.items()
-    ]
+    notes += [f"{name} is {settings[name]}, in training {', '.join(other)}" for name, other in others.items()]
+    return settings, list(map(printable, notes))
 
 
 def _trained_with(text: str) -> dict[str, Any]:

@@ -41,7 +41,7 @@ from magrl.training.loggers import open_log
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
 """Measures of the validation tasks in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
-SHARED = ("guided", "scenario", "zeta", "start_heading", "noise")
+SHARED = ("guided", "task", "scenario", "zeta", "start_heading", "noise")
 """Settings that the file of the policy holds, for evaluations."""
 
 
@@ -223,10 +223,12 @@ class Run:
 
         Raises:
             UsageError: if no checkpoint can be read, or it is of other settings.
+            ValueError: for a policy that could not be saved.
         """
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
         if isinstance(policy, FieldPolicy):
+            policy.check_actor()
             policy.training = {name: value for name, value in self.settings.items() if name in SHARED}
         self.statistics.first_cohort = env.num_envs * env.max_steps
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}

@@ -56,17 +56,19 @@ MOST_SPIKES = 0.2
 MOST_DRIFT, LEAST_TURN_DEG = 0.25, 20.0
 """Share of a distance and angle of a course that currents explain, also an error that no compass has; chosen."""
 _PLACE = "latitude", "longitude", "altitude"
+NAMED = {key: key for key in (*NAMES, "heading", "distance", "speed", *_PLACE)}
+"""Columns of a file by what they are."""
 
 
-def read_readings(path: Path | str, names: Mapping[str, str], time: str | None = None) -> DataFrame:
+def read_readings(path: Path | str, names: Mapping[str, str] = NAMED, time: str | None = "time") -> DataFrame:
     """Return the readings of a CSV file with a header, one for each leg.
 
     Args:
         path: the file.
-        names: its columns by ``D``, ``I``, ``B_H``, ``heading``, and ``distance``, or ``speed`` beside a time; and
-            optionally ``latitude`` and ``longitude``, and ``altitude``, which the file may lack. A unit that ends a
-            name counts, such as of ``H_uT``, and a name is also found with one, such as ``altitude_m``; without one, it
-            is nT, deg, km or m/s.
+        names: its columns, if they have other names, by ``D``, ``I``, ``B_H``, ``heading``, and ``distance``, or
+            ``speed`` beside a time; and optionally ``latitude`` and ``longitude``, and ``altitude``, which the file may
+            lack. A unit that ends a name counts, such as of ``H_uT``, and a name is also found with one, such as
+            ``altitude_m``; without one, it is nT, deg, km or m/s.
         time: its column of the time, seconds or ISO 8601, which it may lack.
 
     Returns:
@@ -370,15 +372,17 @@ def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> l
         far = f"the positions are {ratio:.3g} times as far apart as the distances of the legs"
         texts.append(f"{far}: check the log and its unit")
     turn, east = torch.rad2deg(bearing[going]) - heading[going], declination[1:][going]
-    mirrored = torch.rad2deg(bearing[going]) + heading[going]
+    mirrored, scaled = torch.rad2deg(bearing[going]) + heading[going], torch.rad2deg(bearing[going] - heading[going])
     course = torch.deg2rad(turn)
     drift = math.degrees(torch.atan2(course.sin().mean(), course.cos().mean()).item())
-    drifts, left, mirror = (
-        (angle + 180).remainder(360).sub(180).square().mean().sqrt() for angle in (turn, turn - east, mirrored)
+    drifts, left, mirror, radians = (
+        (angle + 180).remainder(360).sub(180).square().mean().sqrt() for angle in (turn, turn - east, mirrored, scaled)
     )
     text = f"the course between positions is {drift:.0f} deg to the right of the heading"
     if drifts > LEAST_TURN_DEG and mirror < drifts / 3:
         texts.append("the courses between positions mirror the headings: longitudes are positive to the west")
+    elif drifts > LEAST_TURN_DEG and radians < drifts / 3:
+        texts.append("the heading fits the courses between positions in radians")
     elif abs(abs(drift) - 180) < LEAST_TURN_DEG:
         texts.append(f"{text}: the heading is reciprocal, or the vehicle goes astern")
     elif drifts > 3 and left < drifts / 3:

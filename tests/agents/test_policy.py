@@ -60,6 +60,16 @@ def test_save_and_load_give_the_same_actions(env, tmp_path: Path) -> None:
         assert all(torch.equal(loaded(state.clone())["action"], policy(state.clone())["action"]) for state in states)
 
 
+def test_an_actor_of_another_shape_is_not_saved(env, tmp_path: Path) -> None:
+    """A file could not be read again; the check draws no random numbers, which a training would miss."""
+    policy = FieldPolicy(PolicyConfig(env.observation_view(), CELLS))
+    policy.actor, state = PolicyConfig(env.observation_view(), (7,)).make_actor(), torch.get_rng_state()
+    with pytest.raises(ValueError, match=r"save_policy\('policy.onnx', actor, view\) for a network of your own"):
+        save_policy(tmp_path / "policy.safetensors", policy)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not (tmp_path / "policy.safetensors").exists()
+
+
 def config(**change) -> Callable:
     return lambda content: content | {"config": content["config"] | change}
 

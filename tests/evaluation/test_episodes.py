@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import numpy as np
 import pytest
 import scipy.stats
 import torch
@@ -22,6 +23,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.envs.measures import path_efficiency, path_measures, spl
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import Flight
+from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import (
     bootstrap_interval,
     first_episode_mask,
@@ -327,10 +329,29 @@ def test_navigators_fly_running_episodes_alone(name: str) -> None:
     found = evaluation_rollout(flight.env_of(navigator), navigator)
     hook.remove()
     env = flight.env_of(navigator)
-    wanted = evaluation_rollout(env, lambda state: navigator(state))  # which may be any function
+    wanted = evaluation_rollout(env, lambda state: navigator(state))  # others may expect all vehicles
     done = found["next", "done"].squeeze(-1)
     assert seen == [12, *(~done).sum(0)[:-1].tolist()]
     assert seen[-1] < seen[0]
     assert done[:, -1].all()
     for key, values in episode_measures(wanted).items():
         torch.testing.assert_close(episode_measures(found)[key], values, rtol=1e-4, atol=1e-3, equal_nan=True)
+
+
+def test_a_function_sees_all_vehicles_at_each_step() -> None:
+    """Of arrays or of TensorDicts: what it remembers by itself has one row for each."""
+    seen = []
+    env = navigation_env(4, seed=0)
+
+    def act(observations, *_):
+        seen.append(len(observations))
+        return np.ones((len(observations), 2)) * [[1.0, 0.0]], None
+
+    done = evaluation_rollout(env, ArrayPolicy(act))["next", "done"].squeeze(-1)
+    assert done[:, :-1].any()
+    assert set(seen) == {4}
+
+
+def test_an_action_of_another_shape_is_named() -> None:
+    with pytest.raises(ValueError, match=r"the agent's action must be \(2, 2\), got \(2, 3\)"):
+        evaluation_rollout(navigation_env(2, seed=0), lambda state: state.set("action", torch.zeros(2, 3)))

@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import figures
 import pytest
 import torch
 from plots import NAVIGATOR_COLORS
@@ -44,8 +45,9 @@ def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv) -> None:
-    assert NAVIGATOR_COLORS.keys() == KINDS.keys() == {"gg_td3", "td3", *NAVIGATORS, *PRETRAINED}
-    assert len(set(NAVIGATOR_COLORS.values())) == len(NAVIGATOR_COLORS)
+    assert NAVIGATOR_COLORS.keys() <= KINDS.keys() == {"gg_td3", "td3", *NAVIGATORS, *PRETRAINED}
+    for shown in (figures.SHOWN, figures.MARKERS):
+        assert len({NAVIGATOR_COLORS[name] for name in shown}) == len(shown)
     for name, kind in KINDS.items():
         assert kind.name == name
         assert kind.label in kind.description
@@ -159,6 +161,10 @@ def test_settings_of_a_training_are_read_from_the_file_of_the_policy(env: Geomag
     assert training_settings(texts, zeta=0.5) == (settings | {"zeta": 0.5}, [note])
     with pytest.raises(ValueError, match=r"trained with different zeta, .* \(.*c\): choose with --zeta"):
         training_settings([*texts, f"{plain}"])
+    eddies = trained(env, tmp_path / "d", task="eddies")
+    assert training_settings([f"{eddies}"])[1] == [
+        f"{eddies} was trained for eddies, and flies other tasks here: score it there"
+    ]
     save_policy(tmp_path / "pilot.safetensors", Anywhere(zeta=0.03))
     assert training_settings([f"{tmp_path / 'pilot.safetensors'}"]) == ({"zeta": 0.03}, [])
 

@@ -82,6 +82,9 @@ def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(said) -> Non
     assert "IGRF" not in text
     assert "Error of the estimated displacement halfway" in text
     assert "4 of 4 readings do not fit IGRF" in said(log.assign(I=-log["I"]), *date)
+    assert "Average readings" not in text
+    slow = log.assign(distance=log["distance"] / 10).drop(columns=["time", "latitude", "longitude"])
+    assert "Warning: legs are 2 km long. Average readings over some 20 km" in said(slow)
     log["heading"] = [0, 1, 2, 1]  # no vehicle was to steer so, but no single row is impossible
     assert "If these are radians, convert them to degrees" in said(log)
 

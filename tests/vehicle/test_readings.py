@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas
@@ -14,7 +15,7 @@ from magrl.field import IGRF, elements_at
 from magrl.field.elements import axes_of_elements, elements_of_axes
 from magrl.geodesy import move
 from magrl.sensor_std import OUTAGE_STD
-from magrl.vehicle.logs import check_speeds, difference_from_igrf, mistakes
+from magrl.vehicle.logs import check_speeds, difference_from_igrf, mistakes, read_readings
 
 DATE = "2026-06-30"
 
@@ -33,6 +34,15 @@ def log() -> pandas.DataFrame:
         rows.append({"D": d, "I": i, "B_H": b, "heading": heading, "distance": distance})
         rows[-1] |= {"latitude": latitude, "longitude": longitude}
     return pandas.DataFrame(rows)
+
+
+def test_a_file_with_the_names_of_readings_needs_no_others(tmp_path: Path) -> None:
+    """Nor distances, if it has times and speeds."""
+    table = log().assign(time=1000.0 * log().index, speed=log()["distance"]).drop(columns="distance")
+    table.to_csv(tmp_path / "log.csv", index=False)
+    found = read_readings(tmp_path / "log.csv")
+    pandas.testing.assert_frame_equal(found[["D", "heading", "latitude"]], log()[["D", "heading", "latitude"]])
+    assert found["distance"].tolist() == log()["distance"].tolist()
 
 
 def test_a_log_without_mistake() -> None:
@@ -57,6 +67,7 @@ D, H = T["D"], T["heading"]
         (T.assign(D=D * RADIANS), ["D fits in radians"]),
         (T.assign(D=D * RADIANS, I=T["I"] * RADIANS), ["fits in radians"]),
         (T.assign(D=D + H * (RADIANS - 1), heading=H * RADIANS), ["the heading fits in radians", "course"]),
+        (T.assign(heading=H * RADIANS), ["the heading fits the courses between positions in radians"]),
         (T.assign(B_H=T["B_H"] / 1000), ["looks like microtesla"]),
         (T.assign(B_H=T["B_H"] / 1e5), ["looks like gauss"]),
         (T.assign(D=D * 0), ["D is 0: the heading is from magnetic north"]),
