@@ -71,21 +71,13 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
     own = isinstance(policy, Navigator) and not isinstance(policy, ArrayPolicy)
     failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
     steps: list[TensorDictBase] = []
-
-    def act(tensordict: TensorDictBase, rows: Tensor) -> TensorDictBase:
-        action = policy(tensordict)["action"]
-        if action.shape != still[rows].shape:
-            raise ValueError(f"the agent's action must be {tuple(still[rows].shape)}, got {tuple(action.shape)}")
-        failed[rows] |= ~torch.isfinite(action.float()).all(-1, keepdim=True)
-        if strict and failed.any():
-            step = f"step {len(steps)} (the first is step 0)"
-            raise ValueError(f"the agent's action is not finite: vehicles {_first(failed)} at {step}")
-        return tensordict.set("action", torch.where(failed[rows], still[rows], action))
-
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _evaluating(policy):
         state, rows = env.reset(), torch.arange(env.num_envs, device=env.device)
         while len(steps) < env.max_steps and len(rows):
-            step, whole = act(state, rows), len(rows) == env.num_envs
+            step, whole = _acted(policy, state, failed, still, rows), len(rows) == env.num_envs
+            if strict and failed.any():
+                where = f"step {len(steps)} (the first is step 0)"
+                raise ValueError(f"the agent's action is not finite: vehicles {_first(failed)} at {where}")
             step = env.step(step) if whole else step.set("next", _following(env, step))
             state, flies = step_mdp(step), ~step["next", "done"].squeeze(-1)
             step = step.exclude(*LARGE_KEYS)
@@ -97,6 +89,17 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
         lost = _first(failed)
         warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=2)
     return rollout
+
+
+def _acted(
+    policy: TensorDictModuleBase, state: TensorDictBase, failed: Tensor, still: Tensor, rows: Tensor
+) -> TensorDictBase:
+    """Return a state of the vehicles in some rows with their actions; those with one that is not finite have failed."""
+    action, stop = policy(state)["action"], still[rows]
+    if action.shape != stop.shape:
+        raise ValueError(f"the agent's action must be {tuple(stop.shape)}, got {tuple(action.shape)}")
+    failed[rows] |= ~torch.isfinite(action.float()).all(-1, keepdim=True)
+    return state.set("action", torch.where(failed[rows], stop, action))
 
 
 def _following(env: EnvBase, state: TensorDictBase) -> TensorDictBase:
