@@ -63,7 +63,7 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
     return {
         "environment: step": lambda: env.step(state),
         "environment: start of an episode": lambda: env.reset(),
-        "belief: move and reading": lambda: read(moved(belief, after.distance, after.heading), after.field, std),
+        "belief: leg and reading": lambda: read(moved(belief, after.distance, after.heading), after.field, std),
         "posterior of the destination": lambda: posterior(goal),
         "track: belief, posterior and plan": lambda: tracking.advance(rules, track.state, after),
         "declaration of the arrival": lambda: tracking.declaring(declared, track, after, track.plan),

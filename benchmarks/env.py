@@ -34,7 +34,7 @@ class Stepper:
 
 
 class Running:
-    """Random moves with automatic resets, begun when episodes end at different steps."""
+    """Random legs with automatic resets, begun when episodes end at different steps."""
 
     def __init__(self, env: GeomagneticNavEnv, begun: int = 60) -> None:
         self.env, self.state = env, env.reset()

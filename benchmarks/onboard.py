@@ -39,7 +39,7 @@ class Aboard:
     def __init__(self, name: str, flown: list[TensorDictBase]) -> None:
         self.vehicle, self.number = Onboard(name, max_steps=50, confidence=1.0), 0
         self.readings = [
-            (*step["field"][0].tolist(), math.degrees(step["heading"].item()), step["move"][0, 0].item())
+            (*step["field"][0].tolist(), math.degrees(step["heading"].item()), step["leg"][0, 0].item())
             for step in flown
         ]
         self.target = flown[0]["target_field"][0].tolist()

@@ -88,7 +88,7 @@ class Track:
         """Scenario of the tasks, with room for all errors of motion."""
         far = self.distance_km[1] > paper.DISTANCE_KM[1]
         size: dict[str, Any] = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"max_latitude": 70}
-        size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
+        size |= {"distance_range_km": tuple(self.distance_km), "max_leg_km": 50.0 + DRIFT_KM * bool(self.conditions)}
         size |= {"date": self.date, "start_heading": "random"} | ({"crust": True, "degree": 60} if self.crust else {})
         earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size)
         tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)

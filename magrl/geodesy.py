@@ -87,7 +87,7 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 
 def steer(
-    heading: Tensor, wanted: Tensor, distance_km: Tensor, max_move_km: float, max_turn_rad: float
+    heading: Tensor, wanted: Tensor, distance_km: Tensor, max_leg_km: float, max_turn_rad: float
 ) -> tuple[Tensor, Tensor]:
     """Return the action that moves a distance at a heading.
 
@@ -97,7 +97,7 @@ def steer(
         heading: ``(...)`` present heading [rad].
         wanted: ``(...)`` heading to move at [rad].
         distance_km: ``(...)`` distance to move [km].
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Returns:
@@ -109,7 +109,7 @@ def steer(
     """
     turn = wrap_angle(wanted - heading)
     within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
-    distance = torch.where(within, distance_km.clamp(0.0, max_move_km), 0.0)
+    distance = torch.where(within, distance_km.clamp(0.0, max_leg_km), 0.0)
     return distance, turn.clamp(-max_turn_rad, max_turn_rad)
 
 

@@ -94,7 +94,7 @@ _ROWS = (
         reference="around",
         bars=("around", "sighted", "detour"),
         picture=("detour", 7),
-        transforms={"TrueWay": {}, "NoGoAreas": {}},
+        transforms={"TrueDisplacement": {}, "NoGoAreas": {}},
         options={"max_steps": 20},
     ),
     NamedTask(
@@ -106,9 +106,9 @@ _ROWS = (
         reference="estimated",
         bars=("parallel", "offset", "estimated", "geodesic", "mapped"),
         picture=("eddies", 0),
-        transforms={"MotionError": {"eddies_km_h": 0.9, "eddy_km": 250.0, "speed_km_h": 1.0}, "TrueWay": {}},
+        transforms={"MotionError": {"eddies_km_h": 0.9, "eddy_km": 250.0, "speed_km_h": 1.0}, "TrueDisplacement": {}},
         options={
-            "max_move_km": 25.0,
+            "max_leg_km": 25.0,
             "max_steps": 60,
             "arrival": "distance",
             "start_heading": "random",

@@ -114,7 +114,7 @@ def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]
     rollout = with_true_field(rollout)
     count = int(first_episode_mask(rollout["next", "done"]).sum(1)[0])
     states = [rollout[0, 0], *(rollout["next"][0, step] for step in range(count))]
-    values = ([*state["position"].tolist(), *state["field"].tolist(), state["move"][0].item()] for state in states)
+    values = ([*state["position"].tolist(), *state["field"].tolist(), state["leg"][0].item()] for state in states)
     names = ("latitude", "longitude", "D", "I", "B_H", "L")
     return [{"navigator": name, "step": step} | dict(zip(names, row, strict=True)) for step, row in enumerate(values)]
 

@@ -30,7 +30,7 @@ from magrl.evaluation.navigators import named
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
-from magrl.tracking.way import Way
+from magrl.tracking.displacement import Displacement
 from magrl.training import UsageError, command, parse
 from magrl.transforms import conditions_named
 
@@ -102,12 +102,12 @@ class Watched(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Show the distance flown, and the estimated remaining displacement with its standard deviation."""
-        way = Way(**tensordict["track", "way"][0].double())
-        left = way.displacement.norm()
-        direction = way.displacement / left.clamp_min(1e-6)
-        error = (direction @ way.covariance @ direction).clamp_min(0).sqrt()
+        displacement = Displacement(**tensordict["track", "displacement"][0].double())
+        left = displacement.mean.norm()
+        direction = displacement.mean / left.clamp_min(1e-6)
+        error = (direction @ displacement.covariance @ direction).clamp_min(0).sqrt()
         self.bar.set_postfix_str(f"estimated {left:.0f} ± {error:.0f} km to go", refresh=False)
-        self.bar.update(min(tensordict["move"][0, 0].item(), self.bar.total - self.bar.n))
+        self.bar.update(min(tensordict["leg"][0, 0].item(), self.bar.total - self.bar.n))
         return self.navigator(tensordict)
 
 
@@ -229,7 +229,7 @@ def fly(config: Config) -> dict[str, Any]:
     }
     base, first = flights["with_signal"][0].base_env, steps["with_signal"][0, 0]
     last = steps["without_signal"]["next"][0, -1]
-    kind = named(config.navigator).kind
+    kind, estimated = named(config.navigator).kind, Displacement(**last["track", "displacement"])
     result = {
         **{key: value for key, value in asdict(config).items() if key != "out"},
         "navigator": kind.name,
@@ -239,7 +239,7 @@ def fly(config: Config) -> dict[str, Any]:
         **{key: first[key].tolist() for key in ("start_position", "target_position")},
         "target_field": true_target(first),
         **measures["with_signal"],
-        "without_signal": measures["without_signal"] | {"ellipse": Way(**last["track", "way"]).ellipse()},
+        "without_signal": measures["without_signal"] | {"ellipse": estimated.ellipse()},
     }
     write_json(config.out / "flight.json", result)
     draw(config, steps, measures, base)

@@ -71,14 +71,14 @@ def check_declination(text: str, place: Tensor, field: FieldModel) -> None:
         )
 
 
-def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km: float = 50.0) -> Region:
+def region_around(start: Tensor, target: Tensor, field: FieldModel, max_leg_km: float = 50.0) -> Region:
     """Return a box around two places, with a margin of up to half their distance, where the declination is continuous.
 
     Args:
         start: ``(2,)`` latitude, longitude [deg].
         target: ``(2,)`` latitude, longitude [deg].
         field: field model.
-        max_move_km: longest leg, which may lead out of the box [km].
+        max_leg_km: longest leg, which may lead out of the box [km].
 
     Raises:
         ValueError: if the declination jumps between them.
@@ -98,7 +98,7 @@ def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km:
         aside = min(margin / math.cos(math.radians((south + north) / 2)), (360 - (east - west)) / 2)
         box = Region((max(south - margin, -89.0), min(north + margin, 89.0)), (west - aside, east + aside))
         try:
-            field_bounds(field, Regions.of(box).reachable(max_move_km))
+            field_bounds(field, Regions.of(box).reachable(max_leg_km))
         except ValueError:
             continue
         return box

@@ -40,7 +40,7 @@ from magrl.transforms import (
     SensorErrors,
     SPLReward,
     TrackField,
-    TrueWay,
+    TrueDisplacement,
     sensor_levels,
 )
 from magrl.transforms.track import known_keys
@@ -57,7 +57,7 @@ from torchrl.objectives.value import GAE
 
 RECIPE = "ppo_anywhere.py"
 LOSSES = ("loss_critic", "loss_actor", "kl_approx", "clip_fraction", "explained_variance")
-OBSERVED = ("observation", "true_way_scaled", "highest_spl")
+OBSERVED = ("observation", "true_displacement_scaled", "highest_spl")
 TRANSITION = (
     *OBSERVED,
     "correction",
@@ -66,7 +66,7 @@ TRANSITION = (
 )
 
 
-class Config(rule_settings("zeta", "arrival", "radius_km", "max_move_km", "max_turn_deg", max_steps=120), PlanetConfig):
+class Config(rule_settings("zeta", "arrival", "radius_km", "max_leg_km", "max_turn_deg", max_steps=120), PlanetConfig):
     """Settings of a training; the defaults are the preset's."""
 
     preset: Literal["far", "fast"] = "far"
@@ -102,12 +102,12 @@ class Config(rule_settings("zeta", "arrival", "radius_km", "max_move_km", "max_t
     @property
     def drift_km(self) -> float:
         """How much farther than its command a current may carry a vehicle [km]."""
-        return self.drift * self.max_move_km
+        return self.drift * self.max_leg_km
 
     @property
     def reach_km(self) -> float:
         """Farthest that a leg takes a vehicle [km]."""
-        return self.max_move_km + self.drift_km
+        return self.max_leg_km + self.drift_km
 
 
 FAR = Config()
@@ -132,11 +132,11 @@ def make_env(base: GeomagneticNavEnv, config: Config) -> TransformedEnv:
     env = TransformedEnv(base, Compose(*errors(config, base.seed), RandomStepPrice(config.price_range, seed=base.seed)))
     rules, known = rules_of(base, config), known_keys(env.observation_spec)
     declaration = [] if rules.signaled else [DeclareArrival(rules, known)]
-    scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
+    scaled_displacement = ObservationNorm(0.0, 1 / 200, ["true_displacement"], ["true_displacement_scaled"])
     keys = [*HighestSPL.default_in_keys]
-    keys[1] = "true_move" if config.drift else "move"
+    keys[1] = "true_leg" if config.drift else "leg"
     highest = HighestSPL(keys)
-    privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
+    privileged = [TrueDisplacement(), scaled_displacement, highest, SPLReward(), RewardSum(["reward"])]
     for transform in (TrackField(rules, known), *declaration, MinMaxNorm(in_keys_inv=["action"]), *privileged):
         env.append_transform(transform)
     return env
@@ -151,9 +151,9 @@ def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config
 
 def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> TensorDictSequential:
     """Return the actor of the training: normal corrections around the ones of ``actor``, and the legs that follow."""
-    network, corrected_move = actor.module
+    network, corrected_leg = actor.module
     drawn = make_drawn_correction(TensorDictModule(network.module, ["observation"], ["mean"]), spread)
-    return TensorDictSequential(drawn, corrected_move)
+    return TensorDictSequential(drawn, corrected_leg)
 
 
 def normalized(transitions: TensorDictBase, floor: float) -> TensorDictBase:

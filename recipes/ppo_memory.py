@@ -44,10 +44,10 @@ from torchrl.objectives.value import GAE
 RECIPE = "ppo_memory.py"
 LOSSES = ("loss_memory", "loss_critic", "loss_actor", "kl_approx", "clip_fraction", "explained_variance")
 KNOWN = ("memory", "observation", "estimate")
-JUDGED = ("observation", "true_way_scaled", "highest_spl")
+JUDGED = ("observation", "true_displacement_scaled", "highest_spl")
 TRANSITION = (*KNOWN, *JUDGED[1:], "correction", "correction_log_prob")
 TRANSITION += tuple(("next", key) for key in (*JUDGED, "reward", "done", "terminated"))
-SEQUENCE = ("observation", "hidden", "is_init", "true_way", "heading")
+SEQUENCE = ("observation", "hidden", "is_init", "true_displacement", "heading")
 
 
 class Config(PlanetConfig):
@@ -89,9 +89,9 @@ def make_env(planets: Scenario, config: Config) -> TransformedEnv:
     env = task_env(
         planets, config, num_envs=config.num_envs, seed=config.seed, reward="spl", step_price=config.step_price
     )
-    scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
+    scaled_displacement = ObservationNorm(0.0, 1 / 200, ["true_displacement"], ["true_displacement_scaled"])
     memory = TensorDictPrimer({"hidden": Unbounded((1, config.memory_size))}, expand_specs=True)
-    for transform in (InitTracker(), memory, scaled_way, RewardSum(["reward"])):
+    for transform in (InitTracker(), memory, scaled_displacement, RewardSum(["reward"])):
         env.append_transform(transform)
     return env
 
@@ -119,7 +119,7 @@ class Leg(nn.Module):
     def forward(self, estimate: Tensor, correction: Tensor, heading: Tensor) -> Tensor:
         """Return ``(..., 2)``."""
         distance, turn = action_of(estimate + correction, heading, **LIMITS).unbind(-1)
-        return torch.stack((2 * distance / LIMITS["max_move_km"] - 1, turn / LIMITS["max_turn_rad"]), -1)
+        return torch.stack((2 * distance / LIMITS["max_leg_km"] - 1, turn / LIMITS["max_turn_rad"]), -1)
 
 
 class Joined(nn.Module):
@@ -148,8 +148,8 @@ def loss_memory(sequences: TensorDictBase, memory: TensorDictSequential) -> Tens
     farther than the longest leg."""
     with set_recurrent_mode(True):
         memory(sequences)
-    way = turned(sequences["true_way"], sequences["heading"])
-    wanted = way / way.norm(dim=-1, keepdim=True).clamp_min(LIMITS["max_move_km"])
+    displacement = turned(sequences["true_displacement"], sequences["heading"])
+    wanted = displacement / displacement.norm(dim=-1, keepdim=True).clamp_min(LIMITS["max_leg_km"])
     return (sequences["estimate"] - wanted).square().sum(-1).mean()
 
 

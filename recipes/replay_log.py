@@ -28,7 +28,7 @@ from magrl.field.elements import NAMES
 from magrl.files import check_writable, write_text, write_with
 from magrl.geodesy import check_positions, geodesic
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.tracking.way import Way
+from magrl.tracking.displacement import Displacement
 from magrl.training import UsageError, command, parse
 from magrl.vehicle.logs import difference_from_igrf, mistakes, read_readings
 from magrl.vehicle.onboard import Onboard
@@ -43,7 +43,7 @@ RECIPE = "replay_log.py"
 ELEMENTS, PLACE = [*NAMES], ("latitude", "longitude")
 OPTIONS = {"D": "declination", "I": "inclination", "B_H": "horizontal"}
 """Options that name the columns of the elements."""
-COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
+COMMANDED = ["leg_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
 """Columns of what the navigator would have commanded and estimated."""
 SHORT_KM = 5.0
 """Median length of the legs below which readings should be averaged [km]."""
@@ -148,8 +148,9 @@ def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.Dat
             order = board.step(declination, row["I"], row["B_H"], heading, row["distance"])
         except ValueError as error:
             raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}") from error
-        row = (order.distance_km, order.turn_deg, order.heading_deg, *order.way_km, order.error_km, order.confidence)
-        commands.append((*row, order.stop or "", order.way_covariance_km2))
+        row = (order.distance_km, order.turn_deg, order.heading_deg, *order.displacement_km)
+        estimated = order.error_km, order.confidence
+        commands.append((*row, *estimated, order.stop or "", order.displacement_covariance_km2))
     table = pd.concat((log.reset_index(drop=True), pd.DataFrame(commands, columns=COMMANDED)), axis=1)
     return table.assign(north_deg=vehicle_north(log, date).numpy() * magnetic)
 
@@ -176,10 +177,10 @@ def vehicle_north(log: pd.DataFrame, date: str | None) -> torch.Tensor:
     return torch.tensor(log["D"].to_numpy(dtype=float)) - difference_from_igrf(log, date)[:, 0]
 
 
-def last_way(table: pd.DataFrame) -> Way:
+def last_displacement(table: pd.DataFrame) -> Displacement:
     """Return the estimate after the last row."""
     last = table.iloc[-1]
-    return Way(torch.tensor([last["north_km"], last["east_km"]]), torch.tensor(last["covariance"]))
+    return Displacement(torch.tensor([last["north_km"], last["east_km"]]), torch.tensor(last["covariance"]))
 
 
 def figure(table: pd.DataFrame, title: str) -> Figure:
@@ -224,7 +225,7 @@ def notes(table: pd.DataFrame) -> list[str]:
         halfway, end = table[["miss_km", "error_km"]].iloc[[len(table) // 2, -1]].to_numpy(float)
         text = "Error of the estimated displacement {}: {:.1f} km; stated {:.1f} km.".format
         lines += [text("halfway", *halfway), text("at the end", *end)]
-    return [*lines, f"The destination is estimated to {last_way(table).ellipse()}."]
+    return [*lines, f"The destination is estimated to {last_displacement(table).ellipse()}."]
 
 
 def main(args: Sequence[str] | None = None) -> None:

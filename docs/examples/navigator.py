@@ -23,9 +23,9 @@ from torch import Tensor
 class SimpleSecant(Navigator):
     """Make two legs at a right angle, then quasi-Newton steps to the destination."""
 
-    def __init__(self, max_move_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
-        super().__init__(max_move_km, max_turn_rad)
-        self.in_keys = ["field", "target_field", "heading", "move", "elapsed_steps"]  # no position, no map
+    def __init__(self, max_leg_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
+        super().__init__(max_leg_km, max_turn_rad)
+        self.in_keys = ["field", "target_field", "heading", "leg", "elapsed_steps"]  # no position, no map
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return what an episode starts with: the reading, and an unknown Jacobian of D and I."""
@@ -37,15 +37,15 @@ class SimpleSecant(Navigator):
         here, target = (seen[key][:, :2].double() for key in ("field", "target_field"))
         heading = seen["heading"].squeeze(-1).double()
         direction = torch.stack((heading.cos(), heading.sin()), -1)  # north, east
-        displacement = seen["move"][:, :1].double() * direction  # of the last leg [km]
-        innovation = here - memory["here"] - (memory["jacobian"] @ displacement.unsqueeze(-1)).squeeze(-1)
-        square = displacement.square().sum(-1).clamp_min(1e-9)[:, None, None]
-        jacobian = memory["jacobian"] + innovation.unsqueeze(-1) * displacement.unsqueeze(-2) / square
+        leg = seen["leg"][:, :1].double() * direction  # of the last leg [km]
+        innovation = here - memory["here"] - (memory["jacobian"] @ leg.unsqueeze(-1)).squeeze(-1)
+        square = leg.square().sum(-1).clamp_min(1e-9)[:, None, None]
+        jacobian = memory["jacobian"] + innovation.unsqueeze(-1) * leg.unsqueeze(-2) / square
         memory.update({"here": here, "jacobian": jacobian})
 
         left = displacement_to(target - here, jacobian)
         bearing = torch.atan2(left[:, 1], left[:, 0])
-        distance, turn = steer(heading, bearing, left.norm(dim=-1), self.max_move_km, self.max_turn_rad)
+        distance, turn = steer(heading, bearing, left.norm(dim=-1), self.max_leg_km, self.max_turn_rad)
         step = seen["elapsed_steps"].squeeze(-1)
         probe_turn = torch.where(step == 0, 0.0, self.max_turn_rad)
         return torch.where(step < 2, 10.0, distance), torch.where(step < 2, probe_turn, turn)

@@ -7,7 +7,7 @@
 Takes two minutes on one core, and needs the extra `minari`. There is one dataset for each policy and level of white
 noise, such as `magrl/earth-kalman-0_05-v0`, where the standard deviation of D is 0.05 deg. At one level, all policies
 fly the same tasks with the same errors, in random regions of the Earth or of random planets, with an arrival signal.
-Observations are `field`, `target_field`, `move` and `heading`; actions are distance [km] and turn [rad]; the reward is
+Observations are `field`, `target_field`, `leg` and `heading`; actions are distance [km] and turn [rad]; the reward is
 `SPLReward`. The metadata holds mean returns as references (`ref_min_score` of random actions, `ref_max_score` of
 `kalman`), the command, and the call that makes the environment: after `reset(seed=seed)` with the seed of an episode,
 vehicle i of it flies episode i.

@@ -53,7 +53,7 @@ BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around th
 class Detour(Navigator):
     """Follow the shortest path around the no-go areas, through points beside their edges: an oracle."""
 
-    in_keys = ["true_way", "heading", "no_go_areas", "elapsed_steps"]
+    in_keys = ["true_displacement", "heading", "no_go_areas", "elapsed_steps"]
     BESIDE_KM, POINTS = 3.0, 12
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
@@ -106,7 +106,7 @@ class Around(TensorDictModuleBase):
     """Turn the leg of a navigator by the least angle that clears the no-go areas in sight: a rule on public keys.
 
     Args:
-        navigator: navigator that knows nothing of areas, with its ``max_move_km`` and ``max_turn_rad``.
+        navigator: navigator that knows nothing of areas, with its ``max_leg_km`` and ``max_turn_rad``.
     """
 
     out_keys = ["action"]
@@ -117,7 +117,7 @@ class Around(TensorDictModuleBase):
     def __init__(self, navigator: Navigator) -> None:
         super().__init__()
         self.navigator, self.in_keys = navigator, [*navigator.in_keys, "areas"]
-        self.limits = navigator.max_move_km, navigator.max_turn_rad
+        self.limits = navigator.max_leg_km, navigator.max_turn_rad
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -132,7 +132,7 @@ class Around(TensorDictModuleBase):
         return tensordict.set("action", torch.stack(steer(torch.zeros_like(turn), chosen, length, *self.limits), -1))
 
     def _inside(self, areas: Tensor, angle: Tensor, reach: Tensor) -> Tensor:
-        """Return how far ways at angles ``(N, A)`` enter areas and the strip beside them, ``(N, A)`` [km]."""
+        """Return how far paths at angles ``(N, A)`` enter areas and the strip beside them, ``(N, A)`` [km]."""
         forward, right, size = (part.unsqueeze(-2) for part in areas.unflatten(-1, (SEEN, 3)).unbind(-1))
         radius = RADIUS_KM[1] * size
         center_km = radius + SIGHT_KM * (1 - torch.hypot(forward, right))
@@ -153,7 +153,7 @@ def flown(task: str, navigator: str, vehicles: int | None = None, **options: Any
         "sighted": Sighted,
         "around": lambda: Around(Secant.for_env(env.base_env)),
     }
-    rules |= {name: partial(rule, env.base_env.max_move_km) for name, rule in CURRENT_RULES.items()}
+    rules |= {name: partial(rule, env.base_env.max_leg_km) for name, rule in CURRENT_RULES.items()}
     name = "kalman" if navigator == "told" else navigator
     policy = rules[name]() if name in rules else make_navigator(name, env.base_env)
     return env, evaluation_rollout(env, policy)

@@ -84,7 +84,7 @@ class CurrentRule(Navigator):
     Reads fixes, as an environment with observation ``"legs"`` has them.
     """
 
-    in_keys = ["fix", "target_fix", "move", "heading", "elapsed_steps"]
+    in_keys = ["fix", "target_fix", "leg", "heading", "elapsed_steps"]
     optional_keys = ()
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
@@ -93,7 +93,7 @@ class CurrentRule(Navigator):
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         place, step = place_of(seen["fix"], seen["target_fix"]), seen["elapsed_steps"].squeeze(-1)
-        distance, heading = seen["move"][..., 0].double(), seen["heading"].squeeze(-1).double()
+        distance, heading = seen["leg"][..., 0].double(), seen["heading"].squeeze(-1).double()
         rows = torch.arange(len(place))
         moved = place - memory["places"][rows, (step - 1).clamp_min(0)]
         current = moved / distance.clamp_min(1.0).unsqueeze(-1) - unit(heading)
@@ -101,7 +101,7 @@ class CurrentRule(Navigator):
         places[rows, step], currents[rows, (step - 1).clamp_min(0)] = place, current
         memory.update({"places": places, "currents": currents})
         course, length = self.chosen(place, places, currents, step)
-        return steer(heading, course, length, self.max_move_km, self.max_turn_rad)
+        return steer(heading, course, length, self.max_leg_km, self.max_turn_rad)
 
     def chosen(self, place: Tensor, places: Tensor, currents: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Return course [rad] and length [km] of the next leg."""

@@ -207,7 +207,7 @@ def place_error(tasks: int = 64) -> Figures:
         flown = evaluation_rollout(flight.env_of(reckoning, track=True), reckoning)["next"]
         for (given, error), color in zip(place_errors(flown).items(), ("#000000", "#0072B2"), strict=True):
             low, middle, high = error.nanquantile(torch.tensor([0.25, 0.5, 0.75]).double(), 0)
-            path = flown["move"][..., 0].cumsum(1).nanmean(0)
+            path = flown["leg"][..., 0].cumsum(1).nanmean(0)
             axes.plot(path, middle, color=color, label=given)
             axes.fill_between(path, low, high, color=color, alpha=0.2, lw=0)
             quartiles = {"distance_km": path, "lower_quartile_km": low, "median_km": middle, "upper_quartile_km": high}

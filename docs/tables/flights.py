@@ -134,11 +134,11 @@ def believed_places(steps: TensorDictBase) -> dict[str, Tensor]:
     true, target = (steps[key].double() for key in ("position", "target_place"))
     reckoned = [steps["start_place"][:, 0].double()]
     for number in range(steps.shape[1]):  # the heading is that of the leg before
-        move = steps["move"][:, number, 0].double()
-        reckoned.append(move_place(reckoned[-1], steps["heading"][:, number, 0].double(), move))
+        leg = steps["leg"][:, number, 0].double()
+        reckoned.append(move_place(reckoned[-1], steps["heading"][:, number, 0].double(), leg))
     distance, bearing = geodesic(*true.unbind(-1), *target.unbind(-1))
     left = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
-    length, heading = polar(left - steps["track", "way", "displacement"].double())
+    length, heading = polar(left - steps["track", "displacement", "mean"].double())
     return {"compass and log": torch.stack(reckoned[1:], 1), "and IGRF-13": move_place(true, heading, length)}
 
 

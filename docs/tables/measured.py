@@ -99,7 +99,7 @@ def flown(survey: Survey, rows: Tensor, noise: Tensor, target: Tensor, start: Te
         true = left.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
         density = [log_density(goal, points.double()) for points in (places.points, true.unsqueeze(-2))]
         inside = (places.weights * (density[0] > density[1])).sum(-1)
-        found.append(torch.stack((inside.double(), (places.way().displacement - true).norm(dim=-1)), -1))
+        found.append(torch.stack((inside.double(), (places.displacement().mean - true).norm(dim=-1)), -1))
     return torch.stack(found, 1)
 
 

@@ -67,13 +67,13 @@ def columns() -> dict[str, tuple[str, dict[str, Any]]]:
     tasks["readings"] = ("readings", {})
     for name in ("ship", "low-cost"):
         vehicle = CONDITIONS[name]
-        drift_km = vehicle.drift_km(LIMITS["max_move_km"])
+        drift_km = vehicle.drift_km(LIMITS["max_leg_km"])
         planets = planet_scenario(
             256,
             seed=0,
             max_latitude=70,
             distance_range_km=paper.DISTANCE_KM,
-            max_move_km=LIMITS["max_move_km"] + drift_km,
+            max_leg_km=LIMITS["max_leg_km"] + drift_km,
         )
         options = {"scenario": planets, "transforms": vehicle.transforms(), "drift_km": drift_km}
         tasks[name] = ("readings", options)

@@ -22,7 +22,7 @@ from magrl.envs.navigation import task_transforms
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
-from magrl.evaluation.maps import LAND, coastlines, way_ellipse
+from magrl.evaluation.maps import LAND, coastlines, displacement_ellipse
 from magrl.field import IGRF, FieldModel
 from magrl.field.elements import UNITS
 from magrl.files import read_text, write_with
@@ -79,7 +79,7 @@ class Trip(NamedTuple):
         """Return the trip of an episode ``(T,)`` by one of :func:`believed_places`."""
         steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
         places = believed_places(steps["next"][None])[belief][0]
-        key = "track", "way", "covariance"
+        key = "track", "displacement", "covariance"
         pairs = ("position", steps["next", "position"]), ("start_place", places), (key, steps["next", *key])
         return cls(*(torch.cat((steps[name][:1], after)).double() for name, after in pairs))
 
@@ -121,7 +121,7 @@ class Animation:
         axes = self.figure.add_axes((0.01, 0.13, 0.98, 0.79))
         draw_map(axes, FIELD, torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None])))
         draw_scale(axes)
-        circle = way_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
+        circle = displacement_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
         axes.plot(*circle.T.flip(0), color=TARGET, lw=2.5)
         axes.plot(*target.flip(-1)[:, None], "^", color=TARGET, ms=8, zorder=3)
         (self.ellipse,) = axes.fill([0], [0], fc=(*to_rgb(BLUE), 0.25), ec=BLUE, lw=2, label="its estimate, 2σ")
@@ -143,7 +143,7 @@ class Animation:
         here, there = (trip.at(time) for trip in self.trips)
         for line, places in zip(self.lines, (here.believed, here.true, there.true), strict=True):
             line.set_data(*places.T.flip(0))
-        ellipse = way_ellipse(there.believed[-1], torch.zeros(2), there.covariance[-1])
+        ellipse = displacement_ellipse(there.believed[-1], torch.zeros(2), there.covariance[-1])
         self.ellipse.set_xy(ellipse.flip(-1))
         before = [trip.at(int(time)) for trip in self.trips]
         error, other = (f"{trip.error_km:.0f} km" for trip in before)
@@ -242,7 +242,7 @@ def eddies_picture(episode: int = EDDY_EPISODE) -> Figure:
         steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
         paths.append(torch.cat((steps["position"][:1], steps["next", "position"])).double())
         end = "arrives" if steps["next", "success"][-1].item() else "does not arrive"
-        spent = f"{label}: {end}, {steps['next', 'move'][:, 0].sum():.0f} km through the water"
+        spent = f"{label}: {end}, {steps['next', 'leg'][:, 0].sum():.0f} km through the water"
         axes.plot(*paths[-1].T.flip(0), "o-", color=color, lw=2, ms=4, label=spent)
     target = steps["target_position"][0].double()
     shown = torch.cat([*paths, target[None]])
@@ -250,7 +250,7 @@ def eddies_picture(episode: int = EDDY_EPISODE) -> Figure:
     axes.quiverkey(arrows, 0.85, 1.04, 1.0, "1 km/h", labelpos="E")
     axes.set_title("currents, which the vehicles do not know", loc="left", fontsize=10)
     axes.plot(*paths[0][0].flip(0)[:, None], "s", color="black", ms=8, label="start")
-    circle = way_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
+    circle = displacement_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
     axes.plot(*circle.T.flip(0), color=TARGET, lw=2, label="destination, within 25 km")
     axes.set(xlabel="longitude [°]", ylabel="latitude [°]", aspect=1 / math.cos(math.radians(target[0])))
     figure.legend(loc="outside lower center", fontsize=10, ncols=2)

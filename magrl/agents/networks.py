@@ -153,14 +153,14 @@ def make_actor(
     return TensorDictSequential(TensorDictModule(network, ["observation"], ["logits"]), squash)
 
 
-class CorrectedMove(nn.Module):
+class CorrectedLeg(nn.Module):
     """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.planning.corrected`.
 
     Args:
         rules: limits of the leg.
 
     Example:
-        >>> CorrectedMove(Rules())(torch.tensor([25.0, 0.0]), torch.zeros(1), torch.zeros(2))
+        >>> CorrectedLeg(Rules())(torch.tensor([25.0, 0.0]), torch.zeros(1), torch.zeros(2))
         tensor([0., 0.])
     """
 
@@ -172,7 +172,7 @@ class CorrectedMove(nn.Module):
         """Return the scaled action ``(..., 2)`` of a displacement northward and eastward [km] at a heading
         ``(..., 1)`` [rad], and its correction."""
         distance, turn = moving(self.rules, corrected(planned, correction), heading.squeeze(-1)).unbind(-1)
-        return torch.stack((2 * distance / self.rules.max_move_km - 1, turn / self.rules.max_turn_rad), -1)
+        return torch.stack((2 * distance / self.rules.max_leg_km - 1, turn / self.rules.max_turn_rad), -1)
 
 
 def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequential:
@@ -191,7 +191,7 @@ def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequent
     keys = [("track", "plan"), "heading", "correction"]
     return TensorDictSequential(
         TensorDictModule(network, ["observation"], ["correction"]),
-        TensorDictModule(CorrectedMove(rules), keys, ["action"]),
+        TensorDictModule(CorrectedLeg(rules), keys, ["action"]),
     )
 
 

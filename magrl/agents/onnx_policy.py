@@ -19,7 +19,7 @@ from magrl.checks import short
 
 DESCRIPTION = "magrl"
 """Entry of the metadata of a file that describes its policy, as JSON."""
-FORMAT = 1
+FORMAT = 2
 TOLERANCE = 1e-4
 """Largest difference of an exported action in [-1, 1]: float32 operations in another order."""
 _CHECKED = 5  # observations on which a network is checked

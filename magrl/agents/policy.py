@@ -120,7 +120,7 @@ class FieldPolicy(Navigator):
 
     def __init__(self, config: PolicyConfig, actor: TensorDictModuleBase | OnnxNetwork | None = None) -> None:
         check_type(PolicyConfig, config=config)
-        super().__init__(config.view.max_move_km, config.view.max_turn_rad)
+        super().__init__(config.view.max_leg_km, config.view.max_turn_rad)
         self.config, self.view = config, config.view
         self.in_keys = list(dict.fromkeys((*config.view.in_keys, "elapsed_steps")))
         self.observe = Compose(*config.view.observation_transforms())
@@ -178,13 +178,13 @@ class FieldPolicy(Navigator):
             raise ValueError(f"the policy declares its arrival: fly it with arrival 'declared', not {base.arrival!r}")
         if isinstance(view, ObservationView):
             view.check_covers(base.field, base.region.grid(81).to(base.device))
-        (move, turn), (longest, largest) = (
-            (round(part.max_move_km, 3), round(math.degrees(part.max_turn_rad), 3)) for part in (view, base)
+        (leg, turn), (longest, largest) = (
+            (round(part.max_leg_km, 3), round(math.degrees(part.max_turn_rad), 3)) for part in (view, base)
         )
-        if move > longest or turn > largest:
+        if leg > longest or turn > largest:
             raise ValueError(
-                f"the policy was trained for legs up to {move:g} km and turns up to {turn:g}°, the environment allows "
-                f"{longest:g} km and {largest:g}°: evaluate with max_move_km={move:g} and max_turn_deg={turn:g}, or "
+                f"the policy was trained for legs up to {leg:g} km and turns up to {turn:g}°, the environment allows "
+                f"{longest:g} km and {largest:g}°: evaluate with max_leg_km={leg:g} and max_turn_deg={turn:g}, or "
                 "train one for these limits"
             )
 

@@ -30,14 +30,14 @@ from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, geodesic, move, polar, wrap_angle
 from magrl.tracking.records import EpisodeRules
-from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
+from magrl.transforms.errors.base import EPISODE_STREAM, LEG_ERROR
 from magrl.transforms.views import ObservationView
 
 
 class GeomagneticNavEnv(EnvBase):
     """Vehicles that cross a region to a destination of which they know only the magnetic elements.
 
-    Each vehicle measures D, I, B_H; it knows those of its destination, its heading from true north and its last move.
+    Each vehicle measures D, I, B_H; it knows those of its destination, its heading from true north and its last leg.
     It chooses how far to turn and then how far to go. It has arrived when the objective F (Eq. 2-6) is below ``zeta``.
     A vehicle that leaves the region by more than the scenario's margin is lost: the episode ends as a failure. Where
     the scenario has several regions, each episode draws its own.
@@ -47,7 +47,7 @@ class GeomagneticNavEnv(EnvBase):
             vehicle i flies task ``i + k * num_envs`` in episode k, counted around the set.
         num_envs: number of vehicles in the batch.
         drift_km: how much farther than its command a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
-            Above 0, the key ``displacement`` ``(N, 2)`` holds what such an error adds to a move, northward and eastward
+            Above 0, the key ``leg_error`` ``(N, 2)`` holds what such an error adds to a leg, northward and eastward
             [km].
         destination_weight: reward at arrival, zeta_1.
         proximity_weight: reward per unit of the objective, zeta_2.
@@ -70,7 +70,7 @@ class GeomagneticNavEnv(EnvBase):
 
     - ``action`` ``(N, 2)``: distance [km] and turn [rad]; ``(N, 3)`` where the arrival is declared, by a number above 0
     - ``field``, ``target_field`` ``(N, 3)``: D [deg], I [deg], B_H [nT], of the vehicle and of its destination
-    - ``move`` ``(N, 2)``: last leg, distance [km] and turn [rad]
+    - ``leg`` ``(N, 2)``: last leg, distance [km] and turn [rad]
     - ``heading`` ``(N, 1)``: from true north [rad]
     - ``elapsed_steps`` ``(N, 1)``
     - ``declared`` ``(N, 1)``: bool, where the arrival is declared
@@ -131,17 +131,17 @@ class GeomagneticNavEnv(EnvBase):
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
         self._ahead: TensorDict | None = None
-        self._make_specs(self.edge.reachable(self.max_move_km + self.drift_km))
+        self._make_specs(self.edge.reachable(self.max_leg_km + self.drift_km))
         self.set_seed(int(torch.randint(paper.FIRST_RESERVED_SEED, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
         """Keep the rules of a scenario, and its regions, tasks and field on the device of the batch."""
         self.scenario = scenario
-        self.max_steps, self.max_move_km, self.max_turn_rad = (
-            getattr(scenario, name) for name in ("max_steps", "max_move_km", "max_turn_rad")
+        self.max_steps, self.max_leg_km, self.max_turn_rad = (
+            getattr(scenario, name) for name in ("max_steps", "max_leg_km", "max_turn_rad")
         )
         self.arrival, self.zeta, self.start_heading = scenario.arrival, scenario.zeta, scenario.start_heading
-        high = self.max_move_km, self.max_turn_rad, *([1.0] if scenario.declared else [])
+        high = self.max_leg_km, self.max_turn_rad, *([1.0] if scenario.declared else [])
         self.register_buffer("action_high", torch.tensor(high, dtype=torch.float64, device=self.device))
         self.register_buffer("action_low", torch.cat((self.action_high.new_zeros(1), -self.action_high[1:])))
         # Modules of the scenario stay where they are.
@@ -177,7 +177,7 @@ class GeomagneticNavEnv(EnvBase):
         return ObservationView(
             field_low=tuple(low.tolist()),
             field_high=tuple(high.tolist()),
-            max_move_km=self.max_move_km,
+            max_leg_km=self.max_leg_km,
             max_turn_rad=self.max_turn_rad,
             **observed,
         )
@@ -253,7 +253,7 @@ class GeomagneticNavEnv(EnvBase):
         vehicle, episode = self.vehicle[row], self.episode[row]
         start, target, region = self._tasks(vehicle, episode)
         field, target_field = elements_at(self.field, torch.stack((start, target)), region)
-        # Rounded as the vehicle observes it: a move of length 0 must not change the objective.
+        # Rounded as the vehicle observes it: a leg of length 0 must not change the objective.
         field, target_field = field.float().double(), target_field.float().double()
         weights = guidance.objective_weights(field, target_field, self.objective_floors[region]).float().double()
         values = {
@@ -301,14 +301,14 @@ class GeomagneticNavEnv(EnvBase):
         before, region = tensordict["position"], tensordict["region"].squeeze(-1)
         heading = course = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
         if self.drift_km:
-            distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
+            distance, course = polar(displaced(distance, heading, tensordict[LEG_ERROR]))
         after = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
         was_inside, is_inside = self.edge.contains(torch.stack((before, after)), region).unbind(0)
         position = torch.where(was_inside, after, before)  # a lost vehicle stays where it was lost
         field = elements_at(self.field, position, region).float()
         target, weights = tensordict["target_field"].double(), tensordict["objective_weights"].double()
         objective = guidance.objective(field.double(), target, weights)
-        values = {"field": field, "move": action[:, :2].float(), "heading": heading.float().unsqueeze(-1)}
+        values = {"field": field, "leg": action[:, :2].float(), "heading": heading.float().unsqueeze(-1)}
         return values | {"position": position, "objective": objective}, ~(was_inside & is_inside)
 
     def _arrival(self, tensordict: TensorDictBase, action: Tensor, moved: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -330,7 +330,7 @@ class GeomagneticNavEnv(EnvBase):
         return after
 
     def _rewards(self, before: Tensor, objective: Tensor, step: Tensor, arrived: Tensor) -> dict[str, Tensor]:
-        """Return the reward and its terms, ``(N, 1)``, from the objective before and after a move."""
+        """Return the reward and its terms, ``(N, 1)``, from the objective before and after a leg."""
         proximity = guidance.proximity_reward(before, objective, self.proximity_weight, self.objective_limit)
         proximity = guidance.late_decay(proximity, step, self.max_steps)
         destination = guidance.destination_reward(arrived, self.destination_weight)

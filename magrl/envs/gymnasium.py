@@ -181,7 +181,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         idle = self._state["done"].squeeze(-1)  # with NEXT_STEP, those whose next episode starts now
         state = self.torchrl_env.step(self._state.set("action", self._action(actions)))
         self._state, after = self.torchrl_env.step_mdp(state), state["next"]
-        self._length_km = self._length_km + after["move"][:, 0].double()
+        self._length_km = self._length_km + after["leg"][:, 0].double()
         results = [after[key].squeeze(-1).masked_fill(idle, 0) for key in ("reward", "terminated", "truncated")]
         ended = results[1] | results[2]
         info = self._info(after, ended) if ended.any() else {}

@@ -35,7 +35,7 @@ from magrl.transforms import (
     SensorErrors,
     SPLReward,
     TrackField,
-    TrueWay,
+    TrueDisplacement,
     load_conditions,
     sensor_levels,
 )
@@ -101,11 +101,11 @@ def navigation_env(
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
     steps: list[Transform] = []
     if reward == "progress":
-        steps += [TrueWay(), ProgressReward()]
+        steps += [TrueDisplacement(), ProgressReward()]
     elif reward == "paper":  # before errors of the sensors
         steps += [FieldGradient(base.field), GradientHeading(pair=guidance_pair(base)), AlignmentReward()]
     elif reward == "spl":
-        steps += [TrueWay(), HighestSPL(), RandomStepPrice((step_price, step_price)), SPLReward()]
+        steps += [TrueDisplacement(), HighestSPL(), RandomStepPrice((step_price, step_price)), SPLReward()]
     env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))
     for transform in _observation(env, observation):
         env.append_transform(transform)
@@ -286,8 +286,8 @@ def eddies_env(
     motion, _ = task_transforms("eddies", MotionError={"eddies_km_h": eddies_km_h})
     sensors = [SensorErrors(noise)] if any(noise) else []
     defaults = {"observation": "legs", **NAMED_TASKS["eddies"].options}
-    move_km = options.get("max_move_km", defaults["max_move_km"])
-    defaults["drift_km"] = math.ceil(motion.farthest_km(move_km) - move_km)
+    leg_km = options.get("max_leg_km", defaults["max_leg_km"])
+    defaults["drift_km"] = math.ceil(motion.farthest_km(leg_km) - leg_km)
     transforms = [motion, *sensors, *options.pop("transforms", ())]
     return navigation_env(num_envs, transforms=transforms, **{**defaults, **options})
 
@@ -299,7 +299,7 @@ def legs_view(base: GeomagneticNavEnv) -> LegsView:
         >>> legs_view(GeomagneticNavEnv(seed=0)).max_steps
         50
     """
-    return LegsView(max_steps=base.max_steps, max_move_km=base.max_move_km, max_turn_rad=base.scenario.max_turn_rad)
+    return LegsView(max_steps=base.max_steps, max_leg_km=base.max_leg_km, max_turn_rad=base.scenario.max_turn_rad)
 
 
 def task_view(base: GeomagneticNavEnv, task: str, **switches: bool) -> LegsView | ObservationView:
@@ -351,7 +351,7 @@ def task_transforms(task: str, **options: Mapping[str, Any]) -> list[Any]:
 
     Example:
         >>> [type(part).__name__ for part in task_transforms("nogo")], task_transforms("box")
-        (['TrueWay', 'NoGoAreas'], [])
+        (['TrueDisplacement', 'NoGoAreas'], [])
     """
     return [
         getattr(every_transform, name)(**{**own, **options.get(name, {})})

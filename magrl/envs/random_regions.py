@@ -81,7 +81,7 @@ def region_scenario(
     max_latitude: float = 60.0,
     min_intensity_nt: float = 8000.0,
     margin_deg: float = 5.0,
-    max_move_km: float = 50.0,
+    max_leg_km: float = 50.0,
     degree: int | None = None,
     tolerance_nt: float = 0.1,
     **options: Any,
@@ -99,7 +99,7 @@ def region_scenario(
         max_latitude: latitude that no region crosses, north or south [deg].
         min_intensity_nt: lowest B_H in a region [nT].
         margin_deg: how far beyond its region a vehicle may stray before it is lost [deg].
-        max_move_km: longest leg of the environment; the field ends one leg beyond the margin.
+        max_leg_km: longest leg of the environment; the field ends one leg beyond the margin.
         degree: degree of the expansions of the field; by default as high as the tolerance requires, from 12 on, or from
             52 on for a field of degree 133.
         tolerance_nt: largest error of the expansions [nT].
@@ -122,7 +122,7 @@ def region_scenario(
     check_number(0, 2**63 - 1, whole=True, seed=seed)
     check_number(0, 90, above=True, max_latitude=max_latitude)
     check_number(0, max_latitude, above=True, half_size_deg=half_size_deg)
-    check_number(0, min_intensity_nt=min_intensity_nt, margin_deg=margin_deg, max_move_km=max_move_km)
+    check_number(0, min_intensity_nt=min_intensity_nt, margin_deg=margin_deg, max_leg_km=max_leg_km)
     planet = torch.arange(count) // REGIONS_PER_PLANET % len(gauss)
     # Regions of the default size need 12 for a field of degree 13 and 52 for one of degree 133.
     lowest = 12 + max(0, gauss.shape[-1] - 14) // 3
@@ -130,7 +130,7 @@ def region_scenario(
     draw = partial(_drawn_regions, seed, half_size_deg, max_latitude)
 
     def expand(regions: Regions, planet: Tensor, tolerance_nt: float | None = None) -> tuple[Regions, FieldBank]:
-        boxes = regions.expanded(margin_deg).reachable(max_move_km)
+        boxes = regions.expanded(margin_deg).reachable(max_leg_km)
         build = partial(FieldBank.build, gauss, planet, boxes.latitude, boxes.longitude)
         if tolerance_nt is None:  # to choose places
             return boxes, build(degree=[*lower, highest][0], tolerance_nt=None)

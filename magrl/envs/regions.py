@@ -199,18 +199,18 @@ class Regions(Float64Module):
         margin = torch.full_like(self.latitude[:, 0], margin_deg)
         return self._grown(margin, margin)
 
-    def reachable(self, max_move_km: float) -> Regions:
-        """Return every place that one move from inside its box can lead to, rounded up to half a degree.
+    def reachable(self, max_leg_km: float) -> Regions:
+        """Return every place that one leg from inside its box can lead to, rounded up to half a degree.
 
         Raises:
-            ValueError: for a move that is negative or not finite.
+            ValueError: for a leg that is negative or not finite.
 
         Example:
             >>> Regions.of(Region((-10, 0), (160, 170))).reachable(50)
             Regions(Region(latitude=(-10.5, 0.5), longitude=(159.5, 170.5)))
         """
-        check_number(0, max_move_km=max_move_km)
-        reach = torch.full_like(self.latitude[:, 0], math.radians(max_move_km / _SHORTEST_DEGREE_KM))
+        check_number(0, max_leg_km=max_leg_km)
+        reach = torch.full_like(self.latitude[:, 0], math.radians(max_leg_km / _SHORTEST_DEGREE_KM))
         nearest_pole = torch.deg2rad(90 - self.latitude.abs().amax(-1))
         # The farthest that a great circle of this length leads from its meridian; past a pole it leads anywhere.
         aside = torch.asin(torch.sin(reach) / torch.sin(nearest_pole)).where(reach < nearest_pole, math.pi)

@@ -216,7 +216,7 @@ class Scenario(EpisodeRules):
             Regions(Region(latitude=(-15.5, 5.5), longitude=(154.5, 175.5)))
         """
         check_number(0, drift_km=drift_km)
-        return self.edge.reachable(self.max_move_km + drift_km)
+        return self.edge.reachable(self.max_leg_km + drift_km)
 
     def build_field(self, drift_km: float = 0.0) -> FieldModel:
         """Return the field model or bank that is given, or IGRF expanded over every place that a vehicle can reach.

@@ -15,7 +15,7 @@ from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
 from magrl.field.elements import measured_elements
 from magrl.tracking.records import EpisodeRules
-from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
+from magrl.transforms.errors.base import EPISODE_STREAM, LEG_ERROR
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Privileged keys of the terms whose sum is ``reward``; 0 at a reset."""
@@ -41,7 +41,7 @@ class Limits(NamedTuple):
         drift_km: how much farther than its command errors of motion may carry a vehicle [km].
 
     Example:
-        >>> Limits((torch.zeros(3), torch.ones(3)), EpisodeRules()).move.space.low
+        >>> Limits((torch.zeros(3), torch.ones(3)), EpisodeRules()).leg.space.low
         tensor([ 0.0000, -1.5708])
     """
 
@@ -56,15 +56,15 @@ class Limits(NamedTuple):
         return self.rules.declared
 
     @property
-    def move(self) -> Bounded:
+    def leg(self) -> Bounded:
         """Spec of a leg: distance [km] and turn [rad]."""
-        highest = torch.tensor((self.rules.max_move_km, self.rules.max_turn_rad), dtype=torch.float32)
+        highest = torch.tensor((self.rules.max_leg_km, self.rules.max_turn_rad), dtype=torch.float32)
         return float_bounds(highest * torch.tensor((0, -1)), highest)
 
     @property
-    def displacement(self) -> Bounded:
-        """Spec of a displacement from the end of a commanded leg to the end of the true one [km]."""
-        reach = 2 * self.rules.max_move_km + self.drift_km
+    def leg_error(self) -> Bounded:
+        """Spec of the displacement from the end of a commanded leg to the end of the true one [km]."""
+        reach = 2 * self.rules.max_leg_km + self.drift_km
         return Bounded(-reach, reach, (2,), dtype=torch.float64)
 
 
@@ -93,7 +93,7 @@ class Key(NamedTuple):
 KEYS = {
     "field": Key(lambda limits: float_bounds(*limits.field), public=True),
     "target_field": Key(lambda limits: float_bounds(*limits.field), public=True, constant=True),
-    "move": Key(lambda limits: limits.move, public=True),
+    "leg": Key(lambda limits: limits.leg, public=True),
     "heading": Key(lambda _: Bounded(-math.pi, math.pi, (1,), dtype=torch.float32), public=True, state=True),
     "elapsed_steps": Key(lambda _: INTEGER, public=True, state=True),
     "position": Key(lambda _: POSITION, state=True),
@@ -106,12 +106,12 @@ KEYS = {
     EPISODE_STREAM: Key(lambda _: INTEGER, constant=True),
     **{term: Key(lambda _: NUMBER) for term in REWARD_TERMS},
     DECLARED: Key(lambda _: FLAG, public=True, needs="declared"),
-    DISPLACEMENT: Key(lambda limits: limits.displacement, constant=True, needs="drift_km"),
+    LEG_ERROR: Key(lambda limits: limits.leg_error, constant=True, needs="drift_km"),
 }
 """Keys of the environment; a reset fills those with 0 that it does not name."""
 PUBLIC_KEYS = tuple(name for name, key in KEYS.items() if key.public and name not in ("elapsed_steps", DECLARED))
 """Keys that every policy may read, beside ``elapsed_steps``."""
-PRIVILEGED_KEYS = tuple(name for name, key in KEYS.items() if not key.public and name != DISPLACEMENT)
+PRIVILEGED_KEYS = tuple(name for name, key in KEYS.items() if not key.public and name != LEG_ERROR)
 """Keys that a policy may not read if it navigates by the field alone; :data:`magrl.transforms.TRUE_KEYS` has others."""
 
 
@@ -141,7 +141,7 @@ def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor,
     if undefined.any():
         raise ValueError(
             f"the field is not defined on all of {boxes[int(undefined.nonzero()[0])]}, which a vehicle can reach: take "
-            "a field of a larger box, or a smaller region, margin_deg or max_move_km"
+            "a field of a larger box, or a smaller region, margin_deg or max_leg_km"
         )
     if turning.any():
         raise ValueError(

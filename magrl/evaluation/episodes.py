@@ -285,12 +285,12 @@ def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> from tensordict import TensorDict
-        >>> move, heading = torch.tensor([[30.0, 0.1]]), torch.tensor([[0.1]])
-        >>> moved(TensorDict(move=move, heading=heading, true_course=2 * heading))
+        >>> leg, heading = torch.tensor([[30.0, 0.1]]), torch.tensor([[0.1]])
+        >>> moved(TensorDict(leg=leg, heading=heading, true_course=2 * heading))
         (tensor([30.], dtype=torch.float64), tensor([0.2000], dtype=torch.float64))
     """
     course = steps.get("true_course", steps.get("true_heading", steps["heading"]))
-    return steps["move"][..., 0].double(), course.squeeze(-1).double()
+    return steps["leg"][..., 0].double(), course.squeeze(-1).double()
 
 
 def _turns(heading: Tensor, moving: Tensor) -> Tensor:

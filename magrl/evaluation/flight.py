@@ -97,9 +97,9 @@ class Flight:
         if north == MAGNETIC:
             errors = errors.replace_errors(north=MAGNETIC)
         if "weather" in errors.errors:
-            way_km = max(500.0, scenario.distance_range_km[1])
-            errors = errors.replace_errors(weather={"way_km": way_km, **errors.errors["weather"]})
-        drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
+            trip_km = max(500.0, scenario.distance_range_km[1])
+            errors = errors.replace_errors(weather={"trip_km": trip_km, **errors.errors["weather"]})
+        drift = {"drift_km": errors.drift_km(options.get("max_leg_km", scenario.max_leg_km))}
         self.base = GeomagneticNavEnv(scenario, **drift | options)
         self.env = with_conditions(self.base, errors, seed)
         self.sensor_std = errors.std

@@ -30,7 +30,7 @@ from magrl.geodesy import geodesic, move, polar
 
 LAND, ESTIMATE = "#8c6d46", "#56B4E9"
 """Colors of coastlines, and of estimates of the destination."""
-WAY = ("track", "way")
+DISPLACEMENT = ("track", "displacement")
 """Key of the estimated displacement of a :class:`~magrl.transforms.TrackField`."""
 
 
@@ -162,7 +162,7 @@ def trajectories_figure(
         for track in tracks:
             axes.plot(track[:, 1], track[:, 0], "-", color=PATH, lw=1.5, marker=".", ms=4)
         axes.lines[-1].set_label("track")
-        if shown.get(WAY, None) is not None:
+        if shown.get(DISPLACEMENT, None) is not None:
             guesses = region.unwrapped(estimates(shown["next"].reshape(-1), 5000.0))
             axes.plot(guesses[:, 1], guesses[:, 0], ".", color=ESTIMATE, ms=4, label="destination, estimated")
         _write_names(axes, names, region.unwrapped(shown["target_position"][:, 0]))
@@ -227,27 +227,29 @@ def estimates(states: TensorDictBase, farthest_km: float) -> Tensor:
     Example:
         >>> from tensordict import TensorDict
         >>> states = TensorDict(position=torch.zeros(2, 2), batch_size=[2])
-        >>> states["track", "way", "displacement"] = torch.tensor([[111.2, 0.0], [9000.0, 0.0]])
+        >>> states["track", "displacement", "mean"] = torch.tensor([[111.2, 0.0], [9000.0, 0.0]])
         >>> estimates(states, 5000.0).round(decimals=1)
         tensor([[1., 0.]], dtype=torch.float64)
     """
-    way = states[WAY]["displacement"]
-    return _ends(states["position"], way)[way.norm(dim=-1) < farthest_km]
+    displacement = states[DISPLACEMENT]["mean"]
+    return _ends(states["position"], displacement)[displacement.norm(dim=-1) < farthest_km]
 
 
-def _ends(position: Tensor, way: Tensor) -> Tensor:
+def _ends(position: Tensor, displacement: Tensor) -> Tensor:
     """Return where displacements ``(..., 2)`` northward and eastward [km] lead from positions ``(..., 2)`` [deg]."""
-    distance, heading = polar(way.double())
-    latitude, longitude = position.double().expand_as(way).unbind(-1)
+    distance, heading = polar(displacement.double())
+    latitude, longitude = position.double().expand_as(displacement).unbind(-1)
     return torch.stack(move(latitude, longitude, heading, distance), -1)
 
 
-def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: float = 2.0, points: int = 49) -> Tensor:
+def displacement_ellipse(
+    position: Tensor, displacement: Tensor, covariance: Tensor, deviations: float = 2.0, points: int = 49
+) -> Tensor:
     """Return the ellipse of the estimated destination of a vehicle, as a closed line on the globe.
 
     Args:
         position: ``(2,)`` latitude, longitude of the vehicle [deg].
-        way: ``(2,)`` estimated displacement to the destination, northward and eastward [km].
+        displacement: ``(2,)`` estimated displacement to the destination, northward and eastward [km].
         covariance: ``(2, 2)`` its covariance [km^2].
         deviations: size of the ellipse in standard deviations.
         points: number of points.
@@ -257,7 +259,8 @@ def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: f
 
     Example:
         >>> pole = torch.zeros(2)  # a degree is 111 km there
-        >>> way_ellipse(pole, torch.zeros(2), 111.2**2 * torch.eye(2), deviations=1, points=5).round(decimals=1).abs()
+        >>> points = displacement_ellipse(pole, torch.zeros(2), 111.2**2 * torch.eye(2), deviations=1, points=5)
+        >>> points.round(decimals=1).abs()
         tensor([[1., 0.],
                 [0., 1.],
                 [1., 0.],
@@ -267,4 +270,4 @@ def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: f
     angle = torch.linspace(0, 2 * math.pi, points, dtype=torch.float64)
     values, axes = torch.linalg.eigh(covariance.double())
     circle = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
-    return _ends(position, way.double() + deviations * (circle * values.clamp_min(0).sqrt()) @ axes.mT)
+    return _ends(position, displacement.double() + deviations * (circle * values.clamp_min(0).sqrt()) @ axes.mT)

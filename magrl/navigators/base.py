@@ -57,7 +57,7 @@ class Navigator(TensorDictModuleBase):
     list of :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
 
     Args:
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
@@ -72,7 +72,7 @@ class Navigator(TensorDictModuleBase):
         ...     def decide(self, seen, memory):
         ...         heading = seen["heading"].squeeze(-1)
         ...         east, distance = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
-        ...         return steer(heading, east, distance, self.max_move_km, self.max_turn_rad)
+        ...         return steer(heading, east, distance, self.max_leg_km, self.max_turn_rad)
         >>> GeomagneticNavEnv(num_envs=1, seed=0).rollout(2, DueEast())["action"].round(decimals=2)
         tensor([[[30.0000,  1.5700],
                  [30.0000,  0.0000]]])
@@ -99,11 +99,11 @@ class Navigator(TensorDictModuleBase):
     options: tuple[str, ...] = ()
     """Further options of :meth:`for_env` that a command has: ``seed``."""
 
-    def __init__(self, max_move_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
+    def __init__(self, max_leg_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
         super().__init__()
-        check_number(0, above=True, max_move_km=max_move_km)
+        check_number(0, above=True, max_leg_km=max_leg_km)
         check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
-        self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
+        self.max_leg_km, self.max_turn_rad = float(max_leg_km), float(max_turn_rad)
         self.out_keys = ["action"]
 
     @property
@@ -135,7 +135,7 @@ class Navigator(TensorDictModuleBase):
     @staticmethod
     def bounds(env: GeomagneticNavEnv) -> dict[str, Any]:
         """Return the limits of an environment as the constructor names them."""
-        return {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
+        return {"max_leg_km": env.max_leg_km, "max_turn_rad": env.max_turn_rad}
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004

@@ -29,7 +29,7 @@ class DeadReckoning(Navigator):
     the arrival must be declared, it declares at the reckoned destination.
 
     Args:
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         declares: whether the action has a third number, which declares the arrival.
         chart: model of the Earth (:func:`magrl.tracking.earth_model`), of which it reads the declination.
@@ -51,7 +51,7 @@ class DeadReckoning(Navigator):
     def __init__(self, declares: bool = False, chart: EarthModel | None = None, **limits: Any) -> None:
         super().__init__(**limits)
         self.action_size, self.chart = 2 + declares, chart
-        self.in_keys = ["move", "heading", "start_position", "target_position", "elapsed_steps"]
+        self.in_keys = ["leg", "heading", "start_position", "target_position", "elapsed_steps"]
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
@@ -70,12 +70,12 @@ class DeadReckoning(Navigator):
         """Return the action toward the destination."""
         heading = seen["heading"].squeeze(-1).double()
         place = move_place(
-            memory["place"], self._from_north(heading, memory["place"], seen), seen["move"][..., 0].double()
+            memory["place"], self._from_north(heading, memory["place"], seen), seen["leg"][..., 0].double()
         )
         memory["place"] = place
         heading = self._from_north(heading, place, seen)
         distance, bearing = geodesic(*place.unbind(-1), *_known(seen, 1).double().unbind(-1))
-        action = torch.stack(steer(heading, bearing, distance, self.max_move_km, self.max_turn_rad), -1)
+        action = torch.stack(steer(heading, bearing, distance, self.max_leg_km, self.max_turn_rad), -1)
         if not self.declares:
             return action
         arrived = (distance < ARRIVED_KM).unsqueeze(-1)

@@ -16,7 +16,7 @@ from magrl.tracking.network import load_pilot, pretrained
 from magrl.tracking.pilot import Rules, act
 from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, reading_of, track_of
 
-LIMITS = ("max_move_km", "max_turn_deg")
+LIMITS = ("max_leg_km", "max_turn_deg")
 
 
 class Kalman(Navigator):
@@ -50,7 +50,7 @@ class Kalman(Navigator):
 
     def __init__(self, rules: Rules | None = None, network: nn.Module | None = None, **changes: Any) -> None:
         chosen = (rules or Rules()).replace(**changes)
-        super().__init__(chosen.max_move_km, chosen.max_turn_rad)
+        super().__init__(chosen.max_leg_km, chosen.max_turn_rad)
         self.rules, self.network = chosen, network
 
     def fitted(self, env: GeomagneticNavEnv, rules: Mapping[str, Any]) -> Self:

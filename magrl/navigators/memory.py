@@ -25,7 +25,7 @@ from magrl.tracking.network import (
 )
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE, observed_reading
 
-LIMITS = {"max_move_km": 50.0, "max_turn_rad": math.pi / 2}
+LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}
 """Longest leg, the unit of the outputs, and largest turn, in training."""
 
 
@@ -65,13 +65,13 @@ class MemoryNetwork(nn.Module):
         return estimate + self.correct(torch.cat((known, estimate), -1)), after.transpose(0, 1)
 
 
-def action_of(leg: Tensor, heading: Tensor, max_move_km: float, max_turn_rad: float) -> Tensor:
+def action_of(leg: Tensor, heading: Tensor, max_leg_km: float, max_turn_rad: float) -> Tensor:
     """Return distance [km] and turn [rad] of a leg.
 
     Args:
         leg: ``(..., 2)`` northward and eastward [longest legs of the training].
         heading: ``(..., 1)`` [rad].
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Example:
@@ -79,8 +79,8 @@ def action_of(leg: Tensor, heading: Tensor, max_move_km: float, max_turn_rad: fl
         tensor([25.,  0.])
     """
     distance, bearing = polar(leg)
-    limits = max_move_km, max_turn_rad
-    return torch.stack(steer(heading.squeeze(-1), bearing, LIMITS["max_move_km"] * distance, *limits), -1)
+    limits = max_leg_km, max_turn_rad
+    return torch.stack(steer(heading.squeeze(-1), bearing, LIMITS["max_leg_km"] * distance, *limits), -1)
 
 
 class Memory(Navigator):
@@ -122,7 +122,7 @@ class Memory(Navigator):
         **limits: float,
     ) -> None:
         super().__init__(**{name: min(limits.get(name, limit), limit) for name, limit in LIMITS.items()})
-        self.in_keys = ["field", "target_field", "move", "heading", "elapsed_steps"]
+        self.in_keys = ["field", "target_field", "leg", "heading", "elapsed_steps"]
         network, known = (source, None) if isinstance(source, MemoryNetwork) else self._read(source)
         self.network = network.float()  # environments write float32
         self.register_buffer("accuracy", _ends(accuracy or known), persistent=False)
@@ -168,11 +168,11 @@ class Memory(Navigator):
         stated = [seen.get(key, torch.zeros_like(reading)) for key in ACCURACY_KEYS]
         accuracy = [std.clamp(*ends) for std, ends in zip(stated, self.accuracy.unbind(1), strict=True)]
         observed = observed_reading(
-            reading, seen["target_field"], seen["move"][..., :1], heading, accuracy, memory["before"]
+            reading, seen["target_field"], seen["leg"][..., :1], heading, accuracy, memory["before"]
         )
         leg, hidden = self.network(observed, memory["hidden"])
         memory.update({"hidden": hidden, "before": reading})
-        return action_of(leg, heading, self.max_move_km, self.max_turn_rad)
+        return action_of(leg, heading, self.max_leg_km, self.max_turn_rad)
 
 
 def _ends(accuracy: Sequence[Sequence[float]] | None) -> Tensor:

@@ -115,7 +115,7 @@ class Metaheuristic(Navigator):
 
     Args:
         field: field model.
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         seed: seed of the random numbers, which are those of a vehicle, an episode and a step.
 
@@ -141,11 +141,11 @@ class Metaheuristic(Navigator):
         self,
         field: FieldModel,
         *,
-        max_move_km: float = 50.0,
+        max_leg_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         seed: int = 0,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad)
+        super().__init__(max_leg_km, max_turn_rad)
         check_number(whole=True, seed=seed)
         self.field, self.seed = field, int(seed)
         self.in_keys = ["target_field", "heading", "elapsed_steps", "position", "objective_weights", "done"]
@@ -211,13 +211,13 @@ class Metaheuristic(Navigator):
             if generation + 1 < self.generations:
                 state.update(self.evolve(state, fitness, evaluate, draws))
         distance, turn = reachable(best, heading, self.max_turn_rad)
-        return distance.squeeze(-1) * self.max_move_km, turn.squeeze(-1)
+        return distance.squeeze(-1) * self.max_leg_km, turn.squeeze(-1)
 
     def _objective_at(self, seen: TensorDictBase, distance: Tensor, turn: Tensor) -> Tensor:
         """Return F (Eq. 2-6) at the ends of legs ``(N, K)``; infinite beyond the field model."""
         start = seen["position"].unsqueeze(1)
         heading = seen["heading"].double() + turn
-        end = torch.stack(move(start[..., 0], start[..., 1], heading, distance * self.max_move_km), -1)
+        end = torch.stack(move(start[..., 0], start[..., 1], heading, distance * self.max_leg_km), -1)
         there, weights = (seen[key].double().unsqueeze(1) for key in ("target_field", "objective_weights"))
         value = guidance.objective(elements_at(self.field, end), there, weights).squeeze(-1)
         return value.nan_to_num(nan=math.inf)

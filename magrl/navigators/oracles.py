@@ -26,7 +26,7 @@ class Geodesic(Navigator):
     """Fly the shortest path to the destination's position: an oracle, which needs no field.
 
     Args:
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
@@ -47,7 +47,7 @@ class Geodesic(Navigator):
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         distance, bearing = geodesy.geodesic(*seen["position"].unbind(-1), *seen["target_position"].unbind(-1))
         now = seen["heading"].squeeze(-1).double()
-        return steer(now, bearing, distance, self.max_move_km, self.max_turn_rad)
+        return steer(now, bearing, distance, self.max_leg_km, self.max_turn_rad)
 
 
 class ParallelApproach(Navigator):
@@ -59,7 +59,7 @@ class ParallelApproach(Navigator):
 
     Args:
         field: field model or bank of them, usually ``env.field``.
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         pair: two elements whose errors shrink in proportion, ``("D", "I")`` in the paper; all three for None.
 
@@ -80,11 +80,11 @@ class ParallelApproach(Navigator):
     def __init__(
         self,
         field: FieldModel | FieldBank,
-        max_move_km: float = 50.0,
+        max_leg_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         pair: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad)
+        super().__init__(max_leg_km, max_turn_rad)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         self.in_keys = ["field", "target_field", "heading", "position", "elapsed_steps", "region"]
@@ -99,10 +99,10 @@ class ParallelApproach(Navigator):
         error = element_difference(there, here)[:, self.elements]
         gradient = elements_gradient_at(self.field, seen["position"], seen["region"].squeeze(-1))[:, self.elements]
         scale = gradient.new_tensor(CURVATURE)[self.elements]
-        way = displacement_to(error / scale, gradient / scale.unsqueeze(-1))
-        wanted = torch.atan2(way[:, 1], way[:, 0])
+        displacement = displacement_to(error / scale, gradient / scale.unsqueeze(-1))
+        wanted = torch.atan2(displacement[:, 1], displacement[:, 0])
         if len(self.elements) == 2:  # where the two gradients are nearly parallel, least squares still give a heading
             heading, valid = (x.squeeze(-1) for x in parallel_approach(torch.zeros_like(error), error, gradient))
             wanted = torch.where(valid, heading, wanted)
         now = seen["heading"].squeeze(-1).double()
-        return steer(now, wanted, way.norm(dim=-1), self.max_move_km, self.max_turn_rad)
+        return steer(now, wanted, displacement.norm(dim=-1), self.max_leg_km, self.max_turn_rad)

@@ -25,10 +25,10 @@ from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.navigators.base import Navigator, element_indices
 from magrl.sensor_std import PERFECT, SensorStd
+from magrl.tracking.displacement import Displacement
 from magrl.tracking.local import inverse2
 from magrl.tracking.planning import SLOPES, sensor_length
 from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
-from magrl.tracking.way import Way
 
 CURVATURE = (1.5e-6, 1.8e-6, 1.2e-3)
 """Standard deviation of the change of a gradient along the path: D, I [deg], B_H [nT], per km^2, typical of the Earth's
@@ -84,7 +84,7 @@ def first_track(reading: Tensor, prior: GradientPrior, sensor_std: Tensor) -> Fi
 
 
 def next_track(
-    track: FieldTrack, displacement: Tensor, reading: Tensor, sensor_std: Tensor, curvature: Tensor, periods: Tensor
+    track: FieldTrack, leg: Tensor, reading: Tensor, sensor_std: Tensor, curvature: Tensor, periods: Tensor
 ) -> FieldTrack:
     """Return the state after a leg and the reading at its end.
 
@@ -93,7 +93,7 @@ def next_track(
 
     Args:
         track: state before the leg.
-        displacement: ``(..., 2)`` northward and eastward [km].
+        leg: ``(..., 2)`` northward and eastward [km].
         reading: ``(..., E)``.
         sensor_std: ``(..., E)`` standard deviations of its noise.
         curvature: ``(E,)`` see :data:`CURVATURE`.
@@ -101,16 +101,16 @@ def next_track(
 
     Example:
         >>> track = FieldTrack(torch.tensor([[0.0, 1.0, 0.0]]), torch.diag_embed(torch.ones(1, 3)))
-        >>> none, move = torch.zeros(1), torch.tensor([2.0, 0.0])
-        >>> next_track(track, move, torch.tensor([2.0]), none, none, none).mean  # as expected
+        >>> none, leg = torch.zeros(1), torch.tensor([2.0, 0.0])
+        >>> next_track(track, leg, torch.tensor([2.0]), none, none, none).mean  # as expected
         tensor([[2., 1., 0.]])
     """
-    check_tensor(2, displacement=displacement)
-    move = displacement.unsqueeze(-2).to(track.mean)
-    step = torch.eye(3).to(move).expand(*move.shape[:-1], 3, 3).clone()
-    step[..., 0, 1:] = move
-    lever = torch.cat((move.unsqueeze(-2) / 2, torch.eye(2).to(move).expand(*move.shape[:-1], 2, 2)), -2)
-    drift = (curvature.square() * move.square().sum(-1))[..., None, None] * lever @ lever.mT
+    check_tensor(2, leg=leg)
+    leg = leg.unsqueeze(-2).to(track.mean)
+    step = torch.eye(3).to(leg).expand(*leg.shape[:-1], 3, 3).clone()
+    step[..., 0, 1:] = leg
+    lever = torch.cat((leg.unsqueeze(-2) / 2, torch.eye(2).to(leg).expand(*leg.shape[:-1], 2, 2)), -2)
+    drift = (curvature.square() * leg.square().sum(-1))[..., None, None] * lever @ lever.mT
     mean = (step @ track.mean.unsqueeze(-1)).squeeze(-1)
     covariance = step @ track.covariance @ step.mT + drift
     cross = covariance[..., 0]
@@ -119,9 +119,9 @@ def next_track(
     return FieldTrack(mean, covariance - gain.unsqueeze(-1) * cross.unsqueeze(-2))
 
 
-def way_to(
+def estimated_displacement(
     track: FieldTrack, target: Tensor, range_km: float, bias_std: Tensor, curvature: Tensor, periods: Tensor
-) -> Way:
+) -> Displacement:
     """Return the displacement to the place where the field has given values, and its covariance.
 
     It minimizes ``(r - g·d)^T S(d)^-1 (r - g·d) + |d|^2 / range^2``, with the remaining differences r and their
@@ -138,7 +138,7 @@ def way_to(
     Example:
         >>> gradient = torch.tensor([[0.0, 0.01, 0.0], [0.0, 0.0, 0.02]])  # the first element grows northward
         >>> track, none = FieldTrack(gradient, 1e-10 * torch.eye(3).expand(2, 3, 3)), torch.zeros(2)
-        >>> way_to(track, torch.tensor([3.0, 4.0]), 1000.0, none, none, none).displacement.round()
+        >>> estimated_displacement(track, torch.tensor([3.0, 4.0]), 1000.0, none, none, none).mean.round()
         tensor([300., 200.])
     """
     check_number(0, above=True, range_km=range_km)
@@ -150,11 +150,11 @@ def way_to(
     for _ in range(3):
         weighted = slopes / variance.clamp_min(1e-16).unsqueeze(-1)
         covariance = inverse2(weighted.mT @ slopes + eye / range_km**2)
-        way = (covariance @ weighted.mT @ left.unsqueeze(-1)).squeeze(-1)
-        ahead = torch.cat((torch.ones_like(way[..., :1]), way), -1)[..., None, :, None]
+        displacement = (covariance @ weighted.mT @ left.unsqueeze(-1)).squeeze(-1)
+        ahead = torch.cat((torch.ones_like(displacement[..., :1]), displacement), -1)[..., None, :, None]
         variance = (ahead.mT @ track.covariance @ ahead).squeeze((-1, -2)) + bias_std.to(slopes).square()
-        variance = variance + (curvature * way.square().sum(-1, keepdim=True) / 2).square()
-    return Way(way, covariance)
+        variance = variance + (curvature * displacement.square().sum(-1, keepdim=True) / 2).square()
+    return Displacement(displacement, covariance)
 
 
 def wrapped(difference: Tensor, periods: Tensor) -> Tensor:
@@ -191,7 +191,7 @@ class QuasiNewton(Navigator):
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
     Args:
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
@@ -222,7 +222,7 @@ class QuasiNewton(Navigator):
 
     def __init__(
         self,
-        max_move_km: float,
+        max_leg_km: float,
         max_turn_rad: float,
         elements: Sequence[str] = NAMES,
         sensor_std: SensorStd | Sequence[float] = PERFECT,
@@ -230,12 +230,12 @@ class QuasiNewton(Navigator):
         search: bool = False,
         radius_km: float | None = None,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad)
+        super().__init__(max_leg_km, max_turn_rad)
         check_number(0, above=True, zeta=zeta)
         check_type(bool, search=search)
         check_number(0, above=True, optional=True, radius_km=radius_km)
         self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
-        self.in_keys = ["field", "target_field", "heading", "move", "elapsed_steps"]
+        self.in_keys = ["field", "target_field", "heading", "leg", "elapsed_steps"]
         self.elements = element_indices(elements, 2)
         self._register("sensor_std", SensorStd.of(sensor_std))
         self._register("periods", [PERIODS[i] for i in self.elements])
@@ -276,12 +276,12 @@ class QuasiNewton(Navigator):
         return {**track._asdict(), "decisions": decisions, **first_places(seen, self.zeta)}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        return self.move(self.read(seen, memory), seen, memory)
+        return self.next_leg(self.read(seen, memory), seen, memory)
 
     def read(self, seen: TensorDictBase, memory: TensorDictBase) -> FieldTrack:
         """Return the state of the filter after the present reading, and keep it in the memory."""
         before = FieldTrack(memory["mean"], memory["covariance"])
-        reading, moved = seen["field"].double()[:, self.elements], displacement(seen)
+        reading, moved = seen["field"].double()[:, self.elements], last_leg(seen)
         after = next_track(before, moved, reading, self.reading_std(seen), self.curvature, self.periods)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, before.mean, after.mean)
@@ -289,40 +289,42 @@ class QuasiNewton(Navigator):
         memory.update({"mean": mean, "covariance": covariance, "decisions": memory["decisions"] + 1})
         return FieldTrack(mean, covariance)
 
-    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def next_leg(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
         target, bias_std = seen["target_field"].double(), self.accuracy(seen).bias.expand_as(seen["target_field"])
         target, bias_std = target[..., self.elements], bias_std[..., self.elements]
-        way = way_to(track, target, RANGE_KM, bias_std, self.curvature, self.periods)
-        aim = self.aim(track, way, seen, memory)
+        displacement = estimated_displacement(track, target, RANGE_KM, bias_std, self.curvature, self.periods)
+        aim = self.aim(track, displacement, seen, memory)
         return self.steer(seen, aim, aim.norm(dim=-1))
 
-    def aim(self, track: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+    def aim(
+        self, track: FieldTrack, displacement: Displacement, seen: TensorDictBase, memory: TensorDictBase
+    ) -> Tensor:
         """Return the displacement ``(N, 2)`` [km] to the most probable destination; store the end of the last leg."""
         visit_place(seen, memory)
         if not self.search:
-            return way.displacement
+            return displacement.mean
         gradient, covariance = track.mean[..., 1:], track.covariance[..., 1:, 1:]
         ellipse = arrival_ellipse(gradient, covariance, memory["weights"][:, self.elements], self.radius_km)
-        return unvisited(way, memory["visited"], ellipse)
+        return unvisited(displacement, memory["visited"], ellipse)
 
     def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad] of a leg in a direction ``(N, 2)`` northward and eastward."""
         heading = seen["heading"].squeeze(-1).double()
         wanted = torch.atan2(direction[:, 1], direction[:, 0])
-        return steer(heading, wanted, distance, self.max_move_km, self.max_turn_rad)
+        return steer(heading, wanted, distance, self.max_leg_km, self.max_turn_rad)
 
 
-def displacement(seen: TensorDictBase) -> Tensor:
-    """Return the last displacement ``(N, 2)`` northward and eastward [km].
+def last_leg(seen: TensorDictBase) -> Tensor:
+    """Return the last leg ``(N, 2)`` northward and eastward [km].
 
     Example:
         >>> from tensordict import TensorDict
-        >>> displacement(TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]]}, 1))
+        >>> last_leg(TensorDict({"leg": [[30.0, 0.0]], "heading": [[0.0]]}, 1))
         tensor([[30.,  0.]], dtype=torch.float64)
     """
     heading = seen["heading"].double()
-    return seen["move"][..., :1].double() * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
+    return seen["leg"][..., :1].double() * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
 
 
 def search_options(env: GeomagneticNavEnv) -> dict[str, Any]:
@@ -360,14 +362,14 @@ def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
 
     Example:
         >>> from tensordict import TensorDict
-        >>> seen = TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]], "elapsed_steps": [[1]]}, 1)
+        >>> seen = TensorDict({"leg": [[30.0, 0.0]], "heading": [[0.0]], "elapsed_steps": [[1]]}, 1)
         >>> memory = TensorDict({"visited": torch.full((1, 24, 2), 100.0)}, 1)
         >>> visit_place(seen, memory)
         >>> memory["visited"][0, :2]
         tensor([[  0.,   0.],
                 [ 70., 100.]], dtype=torch.float64)
     """
-    visited = visit(memory["visited"].double(), displacement(seen))
+    visited = visit(memory["visited"].double(), last_leg(seen))
     memory["visited"] = torch.where((seen["elapsed_steps"] == 0).unsqueeze(-1), memory["visited"].double(), visited)
 
 
@@ -397,7 +399,7 @@ class Secant(QuasiNewton):
     a quasi-Newton step to the destination's elements, and each reading corrects the Jacobian.
 
     Args:
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         probe_km: length of the two legs [km]; for None :func:`probe_length`, at most the longest leg.
         elements: all three by default, each weighted by how well it determines the displacement; or two of them.
@@ -418,25 +420,25 @@ class Secant(QuasiNewton):
 
     def __init__(
         self,
-        max_move_km: float = 50.0,
+        max_leg_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         probe_km: float | None = None,
         elements: Sequence[str] = NAMES,
         sensor_std: SensorStd | Sequence[float] = PERFECT,
         **options: Any,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, elements, sensor_std, **options)
+        super().__init__(max_leg_km, max_turn_rad, elements, sensor_std, **options)
         noise = SensorStd.of(sensor_std).noise
-        probe_km = min(probe_length(noise), self.max_move_km) if probe_km is None else probe_km
-        check_number(0, max_move_km, above=True, probe_km=probe_km)
+        probe_km = min(probe_length(noise), self.max_leg_km) if probe_km is None else probe_km
+        check_number(0, max_leg_km, above=True, probe_km=probe_km)
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
         std = reading.new_tensor([SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
         return GradientPrior(torch.zeros_like(std), std)
 
-    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        distance, turn = super().move(track, seen, memory)
+    def next_leg(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        distance, turn = super().next_leg(track, seen, memory)
         decisions = memory["decisions"]
         probing, probe_turn = decisions <= 2, torch.where(decisions == 2, self.probe_turn, 0.0)
         return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)
@@ -454,7 +456,7 @@ class MeanJacobian(QuasiNewton):
     Args:
         field: field model, usually ``env.field``.
         position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         **options: ``sensor_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
 
@@ -476,11 +478,11 @@ class MeanJacobian(QuasiNewton):
         self,
         field: FieldModel,
         position: Tensor,
-        max_move_km: float = 50.0,
+        max_leg_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         **options: Any,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, **options)
+        super().__init__(max_leg_km, max_turn_rad, **options)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_tensor(2, position=position)

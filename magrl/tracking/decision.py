@@ -12,8 +12,8 @@ from magrl.checks import check_number, check_tensor
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
 from magrl.tracking.destination import Destination, unit_points
+from magrl.tracking.displacement import DestinationPosterior
 from magrl.tracking.forecast import covariance_after
-from magrl.tracking.way import DestinationPosterior
 
 # Chosen on random planets.
 STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
@@ -35,14 +35,14 @@ class Trip(NamedTuple):
         home: ``(..., 2)`` displacement from the start, northward and eastward [km].
         steps_left: ``(...)`` number of steps that are left after this one.
         price: ``(...)`` price of a step [% of SPL].
-        max_move_km: longest leg.
+        max_leg_km: longest leg.
     """
 
     path: Tensor
     home: Tensor
     steps_left: Tensor
     price: Tensor | float
-    max_move_km: float
+    max_leg_km: float
 
 
 class ArrivalDecision(NamedTuple):
@@ -58,7 +58,7 @@ class ArrivalDecision(NamedTuple):
     probability: Tensor
     worth: Tensor
     attainable: Tensor
-    way: Tensor
+    displacement: Tensor
     stop_km: Tensor
 
     @property
@@ -96,39 +96,40 @@ def arrival_decision(
         tensor(True)
     """
     check_number(0, above=True, radius_km=radius_km)
-    probability, way = posterior.within(radius_km), posterior.aim(radius_km).to(goal.field)
-    counts = torch.tensor((_NONE, *READINGS)).to(way)
+    probability, displacement = posterior.within(radius_km), posterior.aim(radius_km).to(goal.field)
+    counts = torch.tensor((_NONE, *READINGS)).to(displacement)
     readings = counts[1:]
-    distance, stops = way.norm(dim=-1, keepdim=True), radius_km * torch.tensor(STOPS).to(way)
-    place = way.unsqueeze(-2).expand(*way.shape[:-1], len(counts), 2)
-    covariance = covariance_after(goal, way, place, errors, counts).float()
-    apart = way.unsqueeze(-2) * (stops / distance.clamp_min(1e-6)).unsqueeze(-1)
-    now = _within(covariance[..., :1, :, :], way.unsqueeze(-2).float(), radius_km).to(way)[..., 0, 0]
-    later = _within(covariance[..., 1:, :, :], apart.float(), radius_km).to(way)  # (..., K, J)
+    distance, stops = displacement.norm(dim=-1, keepdim=True), radius_km * torch.tensor(STOPS).to(displacement)
+    place = displacement.unsqueeze(-2).expand(*displacement.shape[:-1], len(counts), 2)
+    covariance = covariance_after(goal, displacement, place, errors, counts).float()
+    apart = displacement.unsqueeze(-2) * (stops / distance.clamp_min(1e-6)).unsqueeze(-1)
+    now = _within(covariance[..., :1, :, :], displacement.unsqueeze(-2).float(), radius_km).to(displacement)[..., 0, 0]
+    later = _within(covariance[..., 1:, :, :], apart.float(), radius_km).to(displacement)  # (..., K, J)
     tails = (1 + (probability / now.clamp_min(1e-6)).clamp_max(1)) / 2
     later = later * torch.where(distance[..., 0] < radius_km, tails, 1.0)[..., None, None]
     possible = (readings <= trip.steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
     later = later.where(possible, 0.0)
-    worth, best = (later * _efficiency(trip, way, distance - stops, readings)).flatten(-2).max(-1)
+    worth, best = (later * _efficiency(trip, displacement, distance - stops, readings)).flatten(-2).max(-1)
     attainable = torch.maximum(probability, later.flatten(-2).amax(-1))
-    error = covariance[..., 0, :, :].diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().to(way)
+    error = covariance[..., 0, :, :].diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().to(displacement)
     stop_km = torch.maximum(stops[best % len(STOPS)], (error / 2).clamp_max(SHORT * radius_km))
-    return ArrivalDecision(probability, worth, attainable, way, stop_km)
+    return ArrivalDecision(probability, worth, attainable, displacement, stop_km)
 
 
-def _efficiency(trip: Trip, way: Tensor, further: Tensor, readings: Tensor) -> Tensor:
+def _efficiency(trip: Trip, displacement: Tensor, further: Tensor, readings: Tensor) -> Tensor:
     """Return the SPL of an arrival after a further path ``(..., J)`` [km] and readings ``(K,)``, less the price of the
     steps, over the SPL of an arrival now: ``(..., K, J)``."""
-    straight = (trip.home.to(way) + way).norm(dim=-1).clamp_min(1.0)
-    path = torch.maximum(trip.path.to(way), straight)
-    share = path.unsqueeze(-1) / torch.maximum(trip.path.unsqueeze(-1).to(way) + further, straight.unsqueeze(-1))
-    steps = readings.unsqueeze(-1) + (further / trip.max_move_km).unsqueeze(-2)
-    price = torch.as_tensor(trip.price).to(way) / 100 * (path / straight)
+    straight = (trip.home.to(displacement) + displacement).norm(dim=-1).clamp_min(1.0)
+    flown = trip.path.to(displacement)
+    path = torch.maximum(flown, straight)
+    share = path.unsqueeze(-1) / torch.maximum(flown.unsqueeze(-1) + further, straight.unsqueeze(-1))
+    steps = readings.unsqueeze(-1) + (further / trip.max_leg_km).unsqueeze(-2)
+    price = torch.as_tensor(trip.price).to(displacement) / 100 * (path / straight)
     return share.unsqueeze(-2) - price[..., None, None] * steps
 
 
 def approach(
-    way: Tensor, heading: Tensor, stop_km: Tensor, max_move_km: Tensor | float, max_turn_rad: Tensor | float
+    displacement: Tensor, heading: Tensor, stop_km: Tensor, max_leg_km: Tensor | float, max_turn_rad: Tensor | float
 ) -> Tensor:
     """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes toward the estimated place.
 
@@ -136,10 +137,10 @@ def approach(
     on, it turns by :data:`TURN_DEG` to the right.
 
     Args:
-        way: ``(..., 2)`` northward and eastward [km].
+        displacement: ``(..., 2)`` northward and eastward [km].
         heading: ``(..., 1)`` [rad].
         stop_km: ``(..., 1)`` distance from the place at which the leg ends.
-        max_move_km: longest leg.
+        max_leg_km: longest leg.
         max_turn_rad: largest turn.
 
     Example:
@@ -148,11 +149,11 @@ def approach(
         >>> approach(torch.tensor([0.0, 8.0]), torch.tensor([0.0]), torch.tensor([10.0]), 50.0, 3.0).round(decimals=2)
         tensor([0.0000, 1.5700])
     """
-    check_tensor(2, way=way)
-    north, east = way.split(1, -1)
+    check_tensor(2, displacement=displacement)
+    north, east = displacement.split(1, -1)
     turn = wrap_angle(torch.atan2(east, north) - heading)
-    limit = torch.as_tensor(max_turn_rad, dtype=way.dtype, device=way.device)
-    longest = torch.as_tensor(max_move_km, dtype=way.dtype, device=way.device)
+    limit = torch.as_tensor(max_turn_rad, dtype=displacement.dtype, device=displacement.device)
+    longest = torch.as_tensor(max_leg_km, dtype=displacement.dtype, device=displacement.device)
     distance = (torch.hypot(north, east) - stop_km).clamp_min(0).clamp_max(longest)
     turn = turn.where(distance > 0, math.radians(TURN_DEG))
     return torch.cat((distance.where(turn.abs() <= limit, 0.0), torch.minimum(torch.maximum(turn, -limit), limit)), -1)

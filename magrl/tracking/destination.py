@@ -24,10 +24,10 @@ from magrl.geodesy import geodesic
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.anomalies import crust_correlation, crust_share
 from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief
+from magrl.tracking.displacement import DestinationPosterior, Displacement
 from magrl.tracking.harmonics import UNIT_KM, constant, powers, turning
 from magrl.tracking.local import COEFFICIENTS, levers, monomial_rows, unturned
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
-from magrl.tracking.way import DestinationPosterior, Way
 
 RANGE_KM = 400.0
 """Default of the prior standard deviation of the displacement along each axis [km]."""
@@ -66,7 +66,7 @@ class Destination(NamedTuple):
     noise: Tensor
     crust: Tensor
     share: Tensor
-    between: Way | None = None
+    between: Displacement | None = None
 
     def noise_at(self, square: Tensor) -> Tensor:
         """Return the variance of the field in each axis that the belief does not know, at squared distances [unit^2].
@@ -113,7 +113,7 @@ def destination(
     if place is not None:
         distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
         apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
-        between = Way(apart, belief.covariance[..., PLACE, PLACE] + torch.eye(2).to(apart) * (place_km**2 / 2))
+        between = Displacement(apart, belief.covariance[..., PLACE, PLACE] + torch.eye(2).to(apart) * (place_km**2 / 2))
     else:
         noise, share = noise + _variance(field, std), crust_share(belief.field, errors, crust)
         step = torch.diag_embed(torch.ones_like(belief.mean))
@@ -148,7 +148,7 @@ def log_density(goal: Destination, points: Tensor) -> Tensor:
     return _log_density(goal, points, _moments(goal.belief, points))
 
 
-def mode(goal: Destination) -> Way:
+def mode(goal: Destination) -> Displacement:
     """Return about where the posterior is largest, by Gauss-Newton steps, and the inverse of their normal matrix.
 
     The covariance of the field there counts as constant in each step. The first step has the mean covariance over the
@@ -158,7 +158,7 @@ def mode(goal: Destination) -> Way:
         >>> from magrl.sensor_std import SensorStd
         >>> from magrl.tracking.belief import start
         >>> here = torch.tensor([3.0, 65.0, 18000.0])
-        >>> mode(destination(start(here, SensorStd()), here, 300.0)).displacement.round().abs()
+        >>> mode(destination(start(here, SensorStd()), here, 300.0)).mean.round().abs()
         tensor([0., 0.], dtype=torch.float64)
     """
     cross = torch.eye(2).to(goal.field)
@@ -182,7 +182,7 @@ def mode(goal: Destination) -> Way:
         place = place + torch.stack((ee * nr - ne * er, nn * er - ne * nr), -1) / determinant
         place = place * (_FAR_KM / UNIT_KM / place.norm(dim=-1, keepdim=True)).clamp_max(1)
     matrix = torch.stack((ee, -ne, -ne, nn), -1) / determinant
-    return Way(place * UNIT_KM, matrix.unflatten(-1, (2, 2)) * UNIT_KM**2)
+    return Displacement(place * UNIT_KM, matrix.unflatten(-1, (2, 2)) * UNIT_KM**2)
 
 
 def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
@@ -204,16 +204,16 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
         >>> from magrl.tracking.belief import start
         >>> belief = start(torch.tensor([0.0, 60.0, 20000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
         >>> there = destination(belief, torch.tensor([0.0, 61.0, 19000.0]), 300.0)
-        >>> posterior(there).way().displacement.round(decimals=-1)
+        >>> posterior(there).displacement().mean.round(decimals=-1)
         tensor([ 30., -10.])
     """
     if goal.between is not None:
         return _normal(goal.between, count)
-    way = mode(goal)
-    distance = way.displacement.norm(dim=-1, keepdim=True)
+    displacement = mode(goal)
+    distance = displacement.mean.norm(dim=-1, keepdim=True)
     ahead = torch.tensor([1.0, 0.0]).to(distance)
-    heading = torch.where(distance > 0, way.displacement / distance, ahead)
-    points, density = _points(Way(*(part.float() for part in way)), heading.float(), count)
+    heading = torch.where(distance > 0, displacement.mean / distance, ahead)
+    points, density = _points(Displacement(*(part.float() for part in displacement)), heading.float(), count)
     near, around = (points / UNIT_KM).split((count // 4, count - count // 4), -2)
     parts = (near, _moments(goal.belief, near)), (around, _moments_around(goal.belief, heading, count))
     logarithms = [_log_density(goal, *part) for part in parts]
@@ -222,22 +222,22 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
     weights = torch.softmax(mass, -1)
     volume = math.log(2 * math.pi * (goal.range * UNIT_KM) ** 2) + 1.5 * math.log(2 * math.pi)  # of prior and field
     reached = torch.sigmoid(torch.logsumexp(mass, -1) - volume - _ELSEWHERE_LOG)
-    place = (way.displacement / UNIT_KM).unsqueeze(-2)
+    place = (displacement.mean / UNIT_KM).unsqueeze(-2)
     miss = _covariance(goal, place, _moments(goal.belief, place))[0].squeeze(-1).norm(dim=-1)
     reached = torch.where(miss < _SLACK_NT, 1.0, reached)  # crust and sensors deviate by so much, too
     return DestinationPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0), reached)
 
 
-def _normal(way: Way, count: int) -> DestinationPosterior:
+def _normal(displacement: Displacement, count: int) -> DestinationPosterior:
     """Return points of a normal distribution, of equal weights."""
-    points = unit_points(4 * count)[0].to(way.displacement)
-    first = way.covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt()
-    below = way.covariance[..., 0, 1] / first
-    second = (way.covariance[..., 1, 1] - below * below).clamp_min(_LEAST_KM**2).sqrt()
+    points = unit_points(4 * count)[0].to(displacement.mean)
+    first = displacement.covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt()
+    below = displacement.covariance[..., 0, 1] / first
+    second = (displacement.covariance[..., 1, 1] - below * below).clamp_min(_LEAST_KM**2).sqrt()
     x, y = points.unbind(-1)
     apart = torch.stack((first.unsqueeze(-1) * x, below.unsqueeze(-1) * x + second.unsqueeze(-1) * y), -1)
     apart = apart - apart.mean(-2, keepdim=True)
-    places = (way.displacement.unsqueeze(-2) + apart).float()
+    places = (displacement.mean.unsqueeze(-2) + apart).float()
     return DestinationPosterior(places, torch.full_like(places[..., 0], 1 / count), torch.ones_like(places[..., 0, 0]))
 
 
@@ -383,17 +383,17 @@ def _quadratic(entries: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor
     return x * (a * u + b * v + c * w) + y * (b * u + d * v + e * w) + z * (c * u + e * v + f * w)
 
 
-def _points(way: Way, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def _points(displacement: Displacement, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return points ``(..., M, 2)`` around a displacement of a heading ``(..., 2)`` and around the vehicle [km].
 
     Their density ``(..., M)``, unnormalized, is the second value.
 
     They are laid out along and across the displacement, so that they turn with it.
     """
-    normal, around = (points.to(way.displacement) for points in unit_points(count))
-    distance, (cos, sin) = way.displacement.norm(dim=-1), heading.unbind(-1)
+    normal, around = (points.to(displacement.mean) for points in unit_points(count))
+    distance, (cos, sin) = displacement.mean.norm(dim=-1), heading.unbind(-1)
     turn = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)  # columns: along, across
-    covariance = turn.mT @ way.covariance @ turn * _SPREAD**2
+    covariance = turn.mT @ displacement.covariance @ turn * _SPREAD**2
     first = covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt().unsqueeze(-1)  # Cholesky factor
     below = covariance[..., 0, 1].unsqueeze(-1) / first
     second = (covariance[..., 1, 1].unsqueeze(-1) - below * below).clamp_min(_LEAST_KM**2).sqrt()

@@ -12,14 +12,14 @@ from magrl.field.elements import elements_jacobian
 from magrl.sensor_std import SensorStd
 from magrl.tracking.belief import ANOMALY_KM, DRIFT, MODEL_NT, PLACE
 from magrl.tracking.destination import _DIFFERENCE_KM, _ENTRIES, Destination, _carried, _inverse, _with_latitude
+from magrl.tracking.displacement import Displacement
 from magrl.tracking.harmonics import UNIT_KM, powers, turning
 from magrl.tracking.local import COEFFICIENTS, TERMS, inverse2, inverse3, levers, monomial_rows, slopes, unturned
 from magrl.tracking.prior import DEGREE, closure, lasting_covariances
-from magrl.tracking.way import Way
 
 
 def covariance_after(
-    goal: Destination, place: Tensor, moves: Tensor, errors: SensorStd, readings: Tensor | float = 1.0
+    goal: Destination, place: Tensor, legs: Tensor, errors: SensorStd, readings: Tensor | float = 1.0
 ) -> Tensor:
     """Return the expected covariance ``(..., M, 2, 2)`` of the displacement [km^2] after legs with readings at the end.
 
@@ -30,7 +30,7 @@ def covariance_after(
     Args:
         goal: the destination.
         place: ``(..., 2)`` estimated displacement to the destination [km], where the field is linearized.
-        moves: ``(..., M, 2)`` displacements to the places of the readings [km].
+        legs: ``(..., M, 2)`` displacements to the places of the readings [km].
         errors: accuracy of the readings, tensors ``(..., 3)``.
         readings: number of readings at each place, whose noise is averaged: a number or ``(M,)``.
 
@@ -39,13 +39,13 @@ def covariance_after(
         >>> from magrl.tracking.destination import destination
         >>> here, errors = torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0]))
         >>> goal = destination(start(here, errors), torch.tensor([3.0, 66.0, 17500.0]), 300.0)
-        >>> moves = torch.tensor([[50.0, 0.0], [0.0, 50.0]])
-        >>> covariance_after(goal, torch.tensor([90.0, 0.0]), moves, errors).shape
+        >>> legs = torch.tensor([[50.0, 0.0], [0.0, 50.0]])
+        >>> covariance_after(goal, torch.tensor([90.0, 0.0]), legs, errors).shape
         torch.Size([2, 2, 2])
     """
     if goal.between is not None:
-        return _between_after(goal, goal.between, moves.to(goal.field) / UNIT_KM, errors, readings)
-    belief, place, moves = goal.belief, place.to(goal.field) / UNIT_KM, moves.to(goal.field) / UNIT_KM
+        return _between_after(goal, goal.between, legs.to(goal.field) / UNIT_KM, errors, readings)
+    belief, place, legs = goal.belief, place.to(goal.field) / UNIT_KM, legs.to(goal.field) / UNIT_KM
     eye, apart = torch.eye(3).to(place), _DIFFERENCE_KM / UNIT_KM
     corners = place.unsqueeze(-2) + torch.cat((torch.zeros(1, 2), torch.eye(2))).to(place) * apart
     target, slope = _carried(goal, corners)
@@ -55,7 +55,7 @@ def covariance_after(
     value, derivatives = at_place[..., 0, :, :], (at_place[..., 1:, :, :] - at_place[..., :1, :, :]) / apart
     at_place = torch.cat((value, derivatives.flatten(-3, -2)), -2)  # (..., 9, K + 1)
     slopes = (residual[..., :1, :] - residual[..., 1:, :]).flatten(-2) / apart  # of the prediction: 3 north, 3 east
-    reading, noise = _readings(goal, moves.float(), errors, readings)
+    reading, noise = _readings(goal, legs.float(), errors, readings)
     covariance, state = belief.covariance, COEFFICIENTS + 1
     spread = reading.flatten(-3, -2) @ covariance.float()  # (..., 3 M, S)
     shared = (at_place.float() @ spread[..., :state].mT).unflatten(-1, (-1, 3))  # (..., 9, M, 3)
@@ -64,7 +64,7 @@ def covariance_after(
     total = [(reading[..., i, :] * spread[..., j, :]).sum(-1) + noise[..., i, j] for i, j in _ENTRIES]
     gain = _product(shared, _inverse_entries(total))
     now = value @ covariance[..., :state, :state] @ value.mT
-    square = (place.unsqueeze(-2) - moves).square().sum(-1)
+    square = (place.unsqueeze(-2) - legs).square().sum(-1)
     left = square**DEGREE * closure().left_out_nt ** 2 + goal.noise_at(square)
     after = _entries_first(now.unsqueeze(-3) + left[..., None, None] * eye) - _product(gain[:3], shared[:3])
     weight = _inverse_entries([after[i, j] for i, j in _ENTRIES])
@@ -76,12 +76,12 @@ def covariance_after(
 
 
 def _between_after(
-    goal: Destination, between: Way, moves: Tensor, errors: SensorStd, readings: Tensor | float
+    goal: Destination, between: Displacement, legs: Tensor, errors: SensorStd, readings: Tensor | float
 ) -> Tensor:
     """Return :func:`covariance_after` between two known places, whose displacement has the place's covariance."""
-    reading, noise = _readings(goal, moves, errors, readings)
+    reading, noise = _readings(goal, legs, errors, readings)
     covariance = goal.belief.covariance.unsqueeze(-3)
-    far = moves.norm(dim=-1)[..., None, None] * UNIT_KM
+    far = legs.norm(dim=-1)[..., None, None] * UNIT_KM
     cross = covariance[..., PLACE, :] + far * covariance[..., DRIFT, :]  # of the place after the leg, (..., M, 2, S)
     now = cross[..., PLACE] + far * cross[..., DRIFT]
     target = between.covariance - goal.belief.covariance[..., PLACE, PLACE]
@@ -104,33 +104,33 @@ def _comparable(goal: Destination, rows: Tensor, residual: Tensor) -> tuple[Tens
     return torch.where(magnetic.unsqueeze(-1), turned, rows), residual
 
 
-def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Tensor | float) -> tuple[Tensor, Tensor]:
+def _readings(goal: Destination, legs: Tensor, errors: SensorStd, readings: Tensor | float) -> tuple[Tensor, Tensor]:
     """Return the rows ``(..., M, 3, S)`` of readings of D, I, B_H after legs [unit], and their noise
     ``(..., M, 3, 3)``, both in the dtype of the legs."""
-    belief, mean = goal.belief, goal.belief.mean[..., None, :COEFFICIENTS, None].to(moves)
-    noise = torch.as_tensor(errors.noise).to(moves)
+    belief, mean = goal.belief, goal.belief.mean[..., None, :COEFFICIENTS, None].to(legs)
+    noise = torch.as_tensor(errors.noise).to(legs)
     present = (noise < math.inf) & belief.measured
-    jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(belief.field), 0.0).unsqueeze(-3).to(moves)
-    terms, monomials = monomial_rows(TERMS).to(moves), powers(moves, TERMS)
+    jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(belief.field), 0.0).unsqueeze(-3).to(legs)
+    terms, monomials = monomial_rows(TERMS).to(legs), powers(legs, TERMS)
     field = monomials @ (terms @ mean).squeeze(-1)  # (..., M, 3)
     rows = (monomials @ (jacobian @ terms).flatten(-2)).unflatten(-1, (3, COEFFICIENTS))  # on the elements
     x, y, slope = (
         field[..., 0],
         field[..., 1],
-        unturned(torch.zeros(3).to(moves), belief.latitude, moves)[1].unsqueeze(-1),
+        unturned(torch.zeros(3).to(legs), belief.latitude, legs)[1].unsqueeze(-1),
     )
     turned = (torch.stack((-y, x), -1) @ jacobian[..., 0, :, :2].mT) * slope  # by the offset of the latitude
-    distance, count = moves.norm(dim=-1), torch.as_tensor(readings).to(moves)
-    slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)[..., :3, :].to(moves).unsqueeze(-3)
+    distance, count = legs.norm(dim=-1), torch.as_tensor(readings).to(legs)
+    slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)[..., :3, :].to(legs).unsqueeze(-3)
     drift = (jacobian @ slope) * (distance * UNIT_KM)[..., None, None]
     kept = torch.exp(-distance * (UNIT_KM / ANOMALY_KM))[..., None, None]
     anomaly = kept * jacobian
-    anomaly = anomaly - rows[..., :3] @ goal.share.to(moves).unsqueeze(-3)  # is part of the field
+    anomaly = anomaly - rows[..., :3] @ goal.share.to(legs).unsqueeze(-3)  # is part of the field
     own = torch.diag_embed(present.to(rows)).unsqueeze(-3).expand(*rows.shape[:-1], 3)
-    ahead = moves / (distance * count).clamp_min(1e-9).unsqueeze(-1)  # readings turn with the vehicle between them
+    ahead = legs / (distance * count).clamp_min(1e-9).unsqueeze(-1)  # readings turn with the vehicle between them
     iron = jacobian @ turning(ahead[..., 0], ahead[..., 1], 1)
     white = torch.where(present, noise, 1.0).square().unsqueeze(-2) / count.unsqueeze(-1)
-    new = lasting_covariances(belief.field, errors, goal.crust)[1].to(moves).unsqueeze(-3)
+    new = lasting_covariances(belief.field, errors, goal.crust)[1].to(legs).unsqueeze(-3)
     fresh = (1 - kept.square()) * (jacobian @ new @ jacobian.mT)  # a missing element has none
     noise = torch.diag_embed(white) + fresh + MODEL_NT**2 * jacobian @ jacobian.mT
     place = torch.stack((turned, torch.zeros_like(turned)), -1)

@@ -16,7 +16,7 @@ from magrl.files import load_tensors, save_tensors
 from magrl.tracking.observation import OBSERVATION_SIZE
 from magrl.tracking.pilot import Rules
 
-FILE_FORMAT = 4
+FILE_FORMAT = 5
 """Format of the files of policies."""
 MOST_LAYERS = 64
 """Largest number of hidden layers."""

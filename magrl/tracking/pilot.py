@@ -10,8 +10,8 @@ pure functions: the same ones run in simulation, on board and in training. A ste
     belief = mixture(beliefs, reweighed(log_weight, new))           # how large are anomalies here?
     goal = destination(belief, target)                              # where are its elements, or its place?
     posterior = posterior(goal)
-    aim = unvisited(posterior.way(), visited, ellipse)              # not where the vehicle has been
-    plan = planned_move(goal, posterior, aim, std, price)           # dual control
+    aim = unvisited(posterior.displacement(), visited, ellipse)     # not where the vehicle has been
+    plan = planned_leg(goal, posterior, aim, std, price)            # dual control
     plan = corrected(plan, network(observation(...)))               # of an agent
     action = steer(heading, plan), or the declaration of arrival
 """
@@ -44,18 +44,18 @@ from magrl.tracking.belief import (
 )
 from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
 from magrl.tracking.destination import Destination, destination, posterior
+from magrl.tracking.displacement import Displacement
 from magrl.tracking.earth import EarthModel
 from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
 from magrl.tracking.observation import track_observation, turned
-from magrl.tracking.planning import corrected, planned_move, step_price
+from magrl.tracking.planning import corrected, planned_leg, step_price
 from magrl.tracking.records import Reading, Rules, State, Track
 from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
 from magrl.tracking.survey import anomaly_there, surveyed
-from magrl.tracking.way import Way
 
 PRICE_KM = 300.0
-"""Way that counts as 100 % in the price of a step [km]."""
+"""Displacement that counts as 100 % in the price of a step [km]."""
 FIRST = 2.0
 """Factor of the noise of the first reading, from which latitude and slopes are expected: it may be a spike. Chosen on
 random planets, with 7 % of spikes and without."""
@@ -154,8 +154,8 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
     surprise = (state.log_weight.exp() * stated.square()).sum(-1) / count.squeeze(-1)
     after, heading = anomalies.mixture(beliefs, log_weight), one.heading
-    move = reading.distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
-    path, home, visited = state.path + reading.distance, state.home + move, visit(state.visited, move.to(state.visited))
+    leg = reading.distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
+    path, home, visited = state.path + reading.distance, state.home + leg, visit(state.visited, leg.to(state.visited))
     rest = visited, state.weights, path, home, _declination(after, reading), state.there
     state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *own, *rest)
     return state, surprise, tail
@@ -258,17 +258,18 @@ def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, t
     """Return the track with the estimates and the plan that follow from a state."""
     goal, local, dtype = _goal(rules, state, reading), elements(state.belief), reading.target.dtype
     points = posterior(goal)
-    way = points.way()
-    aim = way.displacement
+    displacement = points.displacement()
+    aim = displacement.mean
     if rules.signaled and rules.target_km is None:
         radius = rules.radius_km if rules.arrival == "distance" else None
         ellipse = arrival_ellipse(local.gradient, local.covariance[..., 1:, 1:], state.weights.double(), radius)
-        aim = unvisited(Way(*(part.double() for part in way)), state.visited.double(), ellipse).to(dtype)
+        exact = Displacement(*(part.double() for part in displacement))
+        aim = unvisited(exact, state.visited.double(), ellipse).to(dtype)
     std, percent = _accuracy(state, reading), rules.step_price if reading.price is None else reading.price.double()
-    limits = rules.max_steps, rules.max_move_km
+    limits = rules.max_steps, rules.max_leg_km
     price = step_price(percent, PRICE_KM, aim.double(), reading.step, std.noise, *limits)
-    plan = planned_move(goal, points, aim.double(), std, price, rules.max_move_km, rules.caution).to(dtype)
-    return Track(state, points, way, local, aim, plan, surprise, tail, goal)
+    plan = planned_leg(goal, points, aim.double(), std, price, rules.max_leg_km, rules.caution).to(dtype)
+    return Track(state, points, displacement, local, aim, plan, surprise, tail, goal)
 
 
 def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:
@@ -283,7 +284,7 @@ def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:
     return track_observation(
         aim=ahead(track.aim),
         plan=ahead(track.plan),
-        covariance=turned(turned(track.way.covariance, heading).mT, heading),
+        covariance=turned(turned(track.displacement.covariance, heading).mT, heading),
         gradient=turned(track.local.gradient.to(like), heading),
         remaining=element_difference(reading.target, track.local.value.to(like)),
         weights=track.state.weights,
@@ -311,7 +312,7 @@ def act(rules: Rules, track: Track, reading: Reading, network: Callable[[Tensor]
 def moving(rules: Rules, plan: Tensor, heading: Tensor) -> Tensor:
     """Return the action ``(..., 2)``, distance [km] and turn [rad], of a displacement ``(..., 2)`` [km]."""
     north, east = plan.unbind(-1)
-    limits = rules.max_move_km, rules.max_turn_rad
+    limits = rules.max_leg_km, rules.max_turn_rad
     return torch.stack(steer(heading, torch.atan2(east, north), torch.hypot(north, east), *limits), -1)
 
 
@@ -325,12 +326,13 @@ def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> t
     """
     state, left = track.state, rules.max_steps - 1 - reading.step
     price = rules.step_price if reading.price is None else reading.price
-    trip = Trip(state.path, state.home, left, price, rules.max_move_km)
+    trip = Trip(state.path, state.home, left, price, rules.max_leg_km)
     goal, std = track.goal or _goal(rules, state, reading), _accuracy(state, reading)
     decision = arrival_decision(goal, track.posterior, std, trip, rules.radius_km)
     heading = _true(reading, state.north).heading.unsqueeze(-1)
-    way, stop = (part.to(action.dtype) for part in (decision.way, decision.stop_km.unsqueeze(-1)))
-    near = way.norm(dim=-1, keepdim=True) < rules.radius_km
-    action = torch.where(near, approach(way, heading, stop, rules.max_move_km, rules.max_turn_rad).to(action), action)
+    displacement, stop = (part.to(action.dtype) for part in (decision.displacement, decision.stop_km.unsqueeze(-1)))
+    near = displacement.norm(dim=-1, keepdim=True) < rules.radius_km
+    last = approach(displacement, heading, stop, rules.max_leg_km, rules.max_turn_rad)
+    action = torch.where(near, last.to(action), action)
     declare = (decision.declare & (decision.probability >= rules.confidence)).unsqueeze(-1)
     return torch.cat((action.masked_fill(declare, 0.0), 2.0 * declare.to(action) - 1), -1), decision

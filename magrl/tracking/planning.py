@@ -10,8 +10,8 @@ from torch import Tensor
 from magrl.checks import check_tensor
 from magrl.sensor_std import SensorStd
 from magrl.tracking.destination import Destination
+from magrl.tracking.displacement import DestinationPosterior
 from magrl.tracking.forecast import covariance_after
-from magrl.tracking.way import DestinationPosterior
 
 CAUTION = 0.3
 """Weight of the uncertainty after a reading; this and :data:`LENGTHS` are from scans on random planets."""
@@ -62,11 +62,11 @@ def sensor_length(std: Tensor) -> Tensor:
 def step_price(
     percent: Tensor | float,
     range_km: float,
-    way: Tensor,
+    displacement: Tensor,
     step: Tensor,
     sensor_std: Tensor | Sequence[float],
     max_steps: int,
-    max_move_km: float,
+    max_leg_km: float,
 ) -> Tensor:
     """Return the price of a step ``(...)`` [km]: it rises as the steps beyond the path's run out.
 
@@ -79,34 +79,34 @@ def step_price(
     Args:
         percent: price while many are left [% of SPL]: p is this share of ``range_km``.
         range_km: distance that counts as 100 % [km].
-        way: ``(..., 2)`` [km].
+        displacement: ``(..., 2)`` [km].
         step: ``(...)`` number of the step.
         sensor_std: standard deviations of a reading, ``(..., 3)`` or 3 numbers.
         max_steps: step limit of the episode.
-        max_move_km: longest leg.
+        max_leg_km: longest leg.
 
     Example:
-        >>> way = torch.tensor([100.0, 0.0])
-        >>> step_price(0.5, 200.0, way, torch.tensor(22), (0.0, 0.0, 0.0), 50, 50.0)
+        >>> displacement = torch.tensor([100.0, 0.0])
+        >>> step_price(0.5, 200.0, displacement, torch.tensor(22), (0.0, 0.0, 0.0), 50, 50.0)
         tensor(16.)
-        >>> step_price(0.5, 200.0, way, torch.tensor(18), (0.1, 0.15, 20.0), 50, 50.0)  # a reading is accurate to 10 km
+        >>> step_price(0.5, 200.0, displacement, torch.tensor(18), (0.1, 0.15, 20.0), 50, 50.0)  # accurate to 10 km
         tensor(16.)
     """
-    length = sensor_length(torch.as_tensor(sensor_std, dtype=way.dtype, device=way.device))
+    length = sensor_length(torch.as_tensor(sensor_std, dtype=displacement.dtype, device=displacement.device))
     reserve = (length / RESERVE_KM).square().clamp_max(RESERVE_SHARE * max_steps)
     reserve = torch.where(length < MISSING_KM, reserve, 0.0)
-    spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km - reserve
+    spare = max_steps - step - 1.5 * displacement.norm(dim=-1) / max_leg_km - reserve
     rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(percent) * range_km / 100
     return torch.maximum(price, price.clamp_max(CHEAP_KM) * rise) * rise
 
 
-def planned_move(
+def planned_leg(
     goal: Destination,
     posterior: DestinationPosterior,
     aim: Tensor,
     errors: SensorStd,
     step_km: Tensor,
-    max_move_km: float,
+    max_leg_km: float,
     caution: float = CAUTION,
     lengths: Sequence[float] = LENGTHS,
 ) -> Tensor:
@@ -126,7 +126,7 @@ def planned_move(
         aim: ``(..., 2)`` northward and eastward [km]; the posterior is shifted to have its mean there.
         errors: accuracy of the next reading, tensors ``(..., 3)``.
         step_km: ``(...)`` price of a step [km], see :func:`step_price`.
-        max_move_km: longest leg.
+        max_leg_km: longest leg.
         caution: weight of the uncertainty.
         lengths: of the legs that are compared, as fractions of the longest; at least :data:`SHORTEST` of the path.
 
@@ -138,29 +138,29 @@ def planned_move(
         >>> from magrl.tracking.destination import destination, posterior
         >>> here, errors = torch.tensor([8.0, -16.0, 35000.0]), SensorStd(torch.tensor([0.02, 0.02, 2.0]))
         >>> goal = destination(start(here, errors), torch.tensor([9.0, -20.0, 34500.0]), range_km=300.0)
-        >>> way = posterior(goal)
-        >>> planned_move(goal, way, way.way().displacement, errors, torch.tensor(1.0), max_move_km=50.0).shape
+        >>> there = posterior(goal)
+        >>> planned_leg(goal, there, there.displacement().mean, errors, torch.tensor(1.0), max_leg_km=50.0).shape
         torch.Size([2])
     """
     check_tensor(2, aim=aim)
     aim = aim.to(goal.field)
-    moves = _moves(aim, lengths, max_move_km)
-    left = aim.unsqueeze(-2) - moves
+    legs = _legs(aim, lengths, max_leg_km)
+    left = aim.unsqueeze(-2) - legs
     shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
-    distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # now it is the same for all
-    cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
+    distance = posterior.mean_distance(legs - shift.unsqueeze(-2)).to(aim.dtype)  # now it is the same for all
+    cost = legs.norm(dim=-1) + distance * (1 + step_km / max_leg_km).unsqueeze(-1)
     kept = cost.topk(min(KEPT, cost.shape[-1]), -1, largest=False).indices
-    moves, left = (x.gather(-2, kept.unsqueeze(-1).expand(*kept.shape, 2)) for x in (moves, left))
-    after = covariance_after(goal, aim, moves, errors)
+    legs, left = (x.gather(-2, kept.unsqueeze(-1).expand(*kept.shape, 2)) for x in (legs, left))
+    after = covariance_after(goal, aim, legs, errors)
     best = (cost.gather(-1, kept) + caution * _detour(left, after)).argmin(-1)[..., None, None]
-    return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+    return legs.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
 
-def corrected(way: Tensor, correction: Tensor) -> Tensor:
+def corrected(displacement: Tensor, correction: Tensor) -> Tensor:
     """Return a planned displacement with a correction that does not depend on its length.
 
     Args:
-        way: ``(..., 2)`` planned displacement [km].
+        displacement: ``(..., 2)`` planned displacement [km].
         correction: ``(..., 2)`` of the logarithm of its length, and of its direction, in units of
             :data:`CORRECTION`.
 
@@ -170,18 +170,19 @@ def corrected(way: Tensor, correction: Tensor) -> Tensor:
         >>> corrected(torch.tensor([20.0, 0.0]), torch.tensor([2.0, 3.0])).round()  # e times as far, to the right
         tensor([ 4., 54.])
     """
-    check_tensor(2, way=way, correction=correction)
+    check_tensor(2, displacement=displacement, correction=correction)
     stretch, angle = (CORRECTION * correction).unbind(-1)
-    (x, y), cos, sin = way.unbind(-1), torch.cos(angle), torch.sin(angle)
+    (x, y), cos, sin = displacement.unbind(-1), torch.cos(angle), torch.sin(angle)
     return torch.exp(stretch).unsqueeze(-1) * torch.stack((cos * x - sin * y, sin * x + cos * y), -1)
 
 
-def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:
+def _legs(displacement: Tensor, lengths: Sequence[float], max_leg_km: float) -> Tensor:
     """Return the displacements ``(..., M, 2)`` [km] that are compared, given the displacement ``(..., 2)``."""
-    distance = way.norm(dim=-1, keepdim=True)
-    whole, least = (x.clamp_max(max_move_km) for x in (distance, SHORTEST * distance))
-    fixed = torch.maximum(way.new_tensor(lengths) * max_move_km, least)
-    bearing = torch.atan2(way[..., 1:], way[..., :1]) + torch.deg2rad(way.new_tensor(ANGLES_DEG))
+    distance = displacement.norm(dim=-1, keepdim=True)
+    whole, least = (x.clamp_max(max_leg_km) for x in (distance, SHORTEST * distance))
+    fixed = torch.maximum(displacement.new_tensor(lengths) * max_leg_km, least)
+    angles = torch.deg2rad(displacement.new_tensor(ANGLES_DEG))
+    bearing = torch.atan2(displacement[..., 1:], displacement[..., :1]) + angles
     directions = torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
     return (torch.cat((fixed, whole), -1)[..., None, None] * directions.unsqueeze(-3)).flatten(-3, -2)
 

@@ -13,10 +13,10 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking import anomalies
 from magrl.tracking.belief import Belief, LocalElements, Motion
 from magrl.tracking.destination import RANGE_KM, Destination
+from magrl.tracking.displacement import DestinationPosterior, Displacement
 from magrl.tracking.earth import EarthModel
 from magrl.tracking.noise import NoiseEstimate
 from magrl.tracking.planning import CAUTION, STEP_PRICE
-from magrl.tracking.way import DestinationPosterior, Way
 
 FARTHEST_START_KM = 100.0
 """Largest error of a known place or a leg [km]: over longer distances, the field is not linear in the place."""
@@ -41,7 +41,7 @@ class EpisodeRules(CheckedModel):
 
     max_steps: Annotated[int, Field(ge=1, le=10**9)] = 50
     """Legs after which an episode is truncated."""
-    max_move_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
+    max_leg_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
     """Longest leg [km]."""
     max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
     """Largest turn to either side before a leg [deg]."""
@@ -206,7 +206,7 @@ class Track(NamedTuple):
     Attributes:
         state: what the next step needs.
         posterior: of the displacement to the destination.
-        way: its mean and covariance [km].
+        displacement: its mean and covariance [km].
         local: elements and gradients at the vehicle.
         aim: ``(..., 2)`` displacement to aim at [km]: the mean, or where it has not been.
         plan: ``(..., 2)`` displacement of the next leg as planned [km].
@@ -218,7 +218,7 @@ class Track(NamedTuple):
 
     state: State
     posterior: DestinationPosterior
-    way: Way
+    displacement: Displacement
     local: LocalElements
     aim: Tensor
     plan: Tensor

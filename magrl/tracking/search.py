@@ -9,7 +9,7 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.checks import check_number, check_tensor
-from magrl.tracking.way import Way
+from magrl.tracking.displacement import Displacement
 
 VISITED = 24
 """Number of past places that a search remembers."""
@@ -24,7 +24,7 @@ _LEAST_KM2 = 1e-12
 _LEAST_ELLIPSE = 1e-12  # [1/km^2]
 
 
-def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
+def unvisited(displacement: Displacement, visited: Tensor, ellipse: Tensor) -> Tensor:
     """Return the displacement to the most probable destination, given where the vehicle did not arrive.
 
     The density of the destination is the density of the estimate, times the probability of not arriving at the nearest
@@ -33,7 +33,7 @@ def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
     logarithm of the density minus the distance over :data:`SEARCH_KM`. Without visited places near it, it is the mean.
 
     Args:
-        way: estimated displacement and its covariance.
+        displacement: estimated displacement and its covariance.
         visited: ``(..., K, 2)`` displacements to the visited places, northward and eastward [km].
         ellipse: ``(..., 2, 2)`` arrival ellipse, where ``d^T E d = 1`` for displacements d [km].
 
@@ -48,28 +48,29 @@ def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
         search.
 
     Example:
-        >>> way = Way(torch.zeros(2), torch.diag(torch.tensor([1.0, 2500.0])))  # known northward, but not eastward
+        >>> covariance = torch.diag(torch.tensor([1.0, 2500.0]))  # known northward, but not eastward
+        >>> displacement = Displacement(torch.zeros(2), covariance)
         >>> ellipse = torch.eye(2) / 400  # 20 km around
-        >>> unvisited(way, torch.full((1, 2), 1e5), ellipse)
+        >>> unvisited(displacement, torch.full((1, 2), 1e5), ellipse)
         tensor([0., 0.])
-        >>> bool(unvisited(way, torch.zeros(1, 2), ellipse)[1].abs() > 20)
+        >>> bool(unvisited(displacement, torch.zeros(1, 2), ellipse)[1].abs() > 20)
         True
     """
-    check_tensor(2, displacement=way.displacement, visited=visited)
-    check_tensor(2, 2, covariance=way.covariance, ellipse=ellipse)
-    samples = _SAMPLES.to(way.displacement)
-    ways = way.displacement.unsqueeze(-2) + samples @ _root(way.covariance).mT
+    check_tensor(2, displacement=displacement.mean, visited=visited)
+    check_tensor(2, 2, covariance=displacement.covariance, ellipse=ellipse)
+    samples = _SAMPLES.to(displacement.mean)
+    candidates = displacement.mean.unsqueeze(-2) + samples @ _root(displacement.covariance).mT
     axes = _root(ellipse, _LEAST_ELLIPSE)  # in these axes, the ellipse is a circle of radius 1
-    (north, east), (seen_n, seen_e) = ((places @ axes).unbind(-1) for places in (ways, visited))
+    (north, east), (seen_n, seen_e) = ((places @ axes).unbind(-1) for places in (candidates, visited))
     from_n, from_e = (
         north.unsqueeze(-1) - seen_n.unsqueeze(-2),
         east.unsqueeze(-1) - seen_e.unsqueeze(-2),
     )  # (..., S, K)
     nearest = (from_n.square() + from_e.square()).amin(-1)
     missed = torch.log1p((_UNNOTICED - 1) * torch.exp2(-nearest))
-    score = missed - samples.square().sum(-1) / 2 - ways.norm(dim=-1) / SEARCH_KM
+    score = missed - samples.square().sum(-1) / 2 - candidates.norm(dim=-1) / SEARCH_KM
     best = torch.where(nearest[..., 0] < 1, score.argmax(-1), 0)[..., None, None]
-    return ways.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+    return candidates.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
 
 def unvisited_yet(like: Tensor) -> Tensor:
@@ -82,14 +83,14 @@ def unvisited_yet(like: Tensor) -> Tensor:
     return like.new_full((*like.shape[:-1], VISITED, 2), _FAR_KM)
 
 
-def visit(visited: Tensor, displacement: Tensor) -> Tensor:
+def visit(visited: Tensor, leg: Tensor) -> Tensor:
     """Return the visited places after a leg: all displacements change by the leg, and its end is the latest place.
 
     After a leg below 1 km, the end takes the place of the one before.
 
     Args:
         visited: ``(..., K, 2)`` displacements to the visited places before the leg [km].
-        displacement: ``(..., 2)`` leg [km].
+        leg: ``(..., 2)`` northward and eastward [km].
 
     Raises:
         ValueError: for shapes that do not match.
@@ -99,10 +100,10 @@ def visit(visited: Tensor, displacement: Tensor) -> Tensor:
         tensor([[ 0.,  0.],
                 [ 1., -3.]])
     """
-    check_tensor(2, visited=visited, displacement=displacement)
-    stayed = (displacement.norm(dim=-1) < _STAYED_KM)[..., None, None]
-    before = torch.where(stayed, visited[..., 1:, :], visited[..., :-1, :]) - displacement.unsqueeze(-2)
-    return torch.cat((torch.zeros_like(displacement).unsqueeze(-2), before), -2)
+    check_tensor(2, visited=visited, leg=leg)
+    stayed = (leg.norm(dim=-1) < _STAYED_KM)[..., None, None]
+    before = torch.where(stayed, visited[..., 1:, :], visited[..., :-1, :]) - leg.unsqueeze(-2)
+    return torch.cat((torch.zeros_like(leg).unsqueeze(-2), before), -2)
 
 
 def arrival_weights(field: Tensor, target_field: Tensor, zeta: float) -> Tensor:

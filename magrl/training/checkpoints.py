@@ -20,7 +20,7 @@ from magrl.checks import UsageError, short
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 
-CHECKPOINT_FORMAT = 1
+CHECKPOINT_FORMAT = 2
 _PATTERN = "checkpoint-*.safetensors"
 PRIVATE = ("_carrier", "_frames", "_iter")
 """Private attributes of TorchRL's ``Collector`` that :class:`RunningEpisodes` saves and restores."""

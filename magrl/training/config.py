@@ -160,7 +160,7 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
 
     Example:
         >>> PlanetConfig(distance_range_km=(100.0, 200.0)).regions
-        {'distance_range_km': (100.0, 200.0), 'max_move_km': 50.0, 'max_latitude': 70}
+        {'distance_range_km': (100.0, 200.0), 'max_leg_km': 50.0, 'max_latitude': 70}
     """
 
     eval_every: Count = 10
@@ -213,7 +213,7 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
         """Options of the regions: large enough for the longest task, and how the distances are drawn."""
         far = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
         size = far if self.distance_range_km[1] > 500 else {"max_latitude": 70}
-        return {"distance_range_km": self.distance_range_km, "max_move_km": self.reach_km, **size}
+        return {"distance_range_km": self.distance_range_km, "max_leg_km": self.reach_km, **size}
 
 
 Config = TypeVar("Config")

@@ -36,7 +36,7 @@ from magrl.transforms.rewards import HighestSPL as HighestSPL
 from magrl.transforms.rewards import ProgressReward as ProgressReward
 from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice
 from magrl.transforms.rewards import SPLReward as SPLReward
-from magrl.transforms.rewards import TrueWay as TrueWay
+from magrl.transforms.rewards import TrueDisplacement as TrueDisplacement
 from magrl.transforms.scaling import MinMaxNorm as MinMaxNorm
 from magrl.transforms.sequences import ReadingObservation as ReadingObservation
 from magrl.transforms.track import DeclareArrival as DeclareArrival

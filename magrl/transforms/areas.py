@@ -44,15 +44,15 @@ class NoGoAreas(EpisodeNumbers):
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
         >>> from magrl.envs import GeomagneticNavEnv
-        >>> from magrl.transforms import TrueWay
-        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueWay(), NoGoAreas()))
+        >>> from magrl.transforms import TrueDisplacement
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueDisplacement(), NoGoAreas()))
         >>> env.rollout(3)["areas"].shape
         torch.Size([2, 3, 9])
     """
 
     channel = 11
     numbers_key, stream_key = "no_go_areas", "no_go_stream"
-    default_in_keys = ("true_way", "heading", "success", "terminated", "truncated", "done")
+    default_in_keys = ("true_displacement", "heading", "success", "terminated", "truncated", "done")
     default_out_keys = ("areas",)
 
     def __init__(self, number: int = NUMBER, **options: Any) -> None:
@@ -70,8 +70,8 @@ class NoGoAreas(EpisodeNumbers):
         return stream_uniform(stream, self.size)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        way, heading, *flags = values
-        place, numbers = -turned(way, heading), episode.numbers
+        displacement, heading, *flags = values
+        place, numbers = -turned(displacement, heading), episode.numbers
         if episode.first:
             numbers = self._placed(numbers, place)
         centers, radii = self.discs(numbers)

@@ -182,8 +182,8 @@ class StatefulTransform(ObservationTransform):
         ...         tensordict["path_km"] = values[0]
         ...     def _advance(self, tensordict, values, state):
         ...         tensordict["path_km"] = state[0] + values[0]
-        >>> step = TensorDict(path_km=torch.tensor([5.0]), next=TensorDict(move=torch.tensor([2.0])))
-        >>> Odometer(in_keys=["move"], out_keys=["path_km"])(step)["next", "path_km"]
+        >>> step = TensorDict(path_km=torch.tensor([5.0]), next=TensorDict(leg=torch.tensor([2.0])))
+        >>> Odometer(in_keys=["leg"], out_keys=["path_km"])(step)["next", "path_km"]
         tensor([7.])
     """
 
@@ -309,8 +309,8 @@ def with_state(input_spec: Composite, state: Mapping[NestedKey, TensorSpec]) -> 
     Example:
         >>> from torchrl.data import Unbounded
         >>> empty = Composite(full_state_spec=None, full_action_spec=None)
-        >>> sorted(with_state(empty, {"way": Unbounded(2)})["full_state_spec"].keys())
-        ['way']
+        >>> sorted(with_state(empty, {"displacement": Unbounded(2)})["full_state_spec"].keys())
+        ['displacement']
     """
     input_spec = input_spec.clone()
     if input_spec["full_state_spec"] is None:
@@ -326,8 +326,8 @@ def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> sorted_keys(TensorDict(move=torch.zeros(2), next=TensorDict(heading=torch.zeros(1))))
-        ["('next', 'heading')", 'move']
+        >>> sorted_keys(TensorDict(leg=torch.zeros(2), next=TensorDict(heading=torch.zeros(1))))
+        ["('next', 'heading')", 'leg']
     """
     return sorted(str(key) for key in container.keys(True, True))
 
@@ -339,8 +339,8 @@ def key_list(keys: Keys) -> list[NestedKey]:
         TypeError: for anything else.
 
     Example:
-        >>> key_list("heading"), key_list(["heading", ("next", "move")])
-        (['heading'], ['heading', ('next', 'move')])
+        >>> key_list("heading"), key_list(["heading", ("next", "leg")])
+        (['heading'], ['heading', ('next', 'leg')])
     """
     keys = [keys] if isinstance(keys, str) else keys
     if not isinstance(keys, Sequence) or not all(isinstance(key, (str, tuple)) for key in keys):

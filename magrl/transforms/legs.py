@@ -146,7 +146,7 @@ class RecentLegs(StatefulTransform):
         torch.Size([2, 3, 45])
     """
 
-    default_in_keys = ("fix", "target_fix", "move", "heading", "elapsed_steps")
+    default_in_keys = ("fix", "target_fix", "leg", "heading", "elapsed_steps")
     default_out_keys = ("recent_legs", "legs")
     in_sizes = {"fix": (2,), "target_fix": (2,), "heading": (1,), "elapsed_steps": (1,)}
 
@@ -170,10 +170,10 @@ class RecentLegs(StatefulTransform):
         self._write(tensordict, values, fix.new_zeros(*fix.shape[:-1], self.count, 5))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        fix, target, move, heading, _ = values
+        fix, target, command, heading, _ = values
         legs, before = state
         moved, left = _displacement(before, fix), _displacement(fix, target)
-        distance, course = move[..., :1].double(), heading.double()
+        distance, course = command[..., :1].double(), heading.double()
         through = distance * torch.cat((torch.cos(course), torch.sin(course)), -1)
         drift = (moved - through) / distance.clamp_min(1.0)
         leg = torch.cat((left + moved / 2, drift, torch.ones_like(distance)), -1)
@@ -181,11 +181,11 @@ class RecentLegs(StatefulTransform):
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], legs: Tensor) -> None:
         fix, target, _, heading, step = values
-        way, back = _displacement(fix, target), -heading.double()
-        distance, (ahead, right) = way.norm(dim=-1, keepdim=True), _turned(way, back).split(1, -1)
+        displacement, back = _displacement(fix, target), -heading.double()
+        distance, (ahead, right) = displacement.norm(dim=-1, keepdim=True), _turned(displacement, back).split(1, -1)
         places, drifts, known = legs.split((2, 2, 1), -1)
-        back = back.unsqueeze(-2)
-        seen = torch.cat((_turned(places - way.unsqueeze(-2), back) / LEG_KM, _turned(drifts, back), known), -1)
+        places, back = places - displacement.unsqueeze(-2), back.unsqueeze(-2)
+        seen = torch.cat((_turned(places, back) / LEG_KM, _turned(drifts, back), known), -1)
         bearing = torch.cat((ahead, right), -1) / distance.clamp_min(1e-6)
         share = step.double() / self.max_steps
         parts = bearing, distance / FAR_KM, torch.log(distance / NEAR_KM + 0.1), share, (seen * known).flatten(-2)

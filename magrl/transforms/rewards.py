@@ -23,7 +23,7 @@ UNIT_KM, ARRIVAL, PRICE = 50.0, 10.0, 0.1
 """Distance of a reward of 1 [km], the longest leg by default; reward for the arrival; price of a step."""
 
 
-class TrueWay(ObservationTransform):
+class TrueDisplacement(ObservationTransform):
     """Write the true displacement to the destination in the vehicle's frame. Privileged: for critics and rewards only.
 
     Args:
@@ -38,19 +38,19 @@ class TrueWay(ObservationTransform):
         >>> from tensordict import TensorDict
         >>> here, there = torch.tensor([[0.0, 160.0]]), torch.tensor([[0.0, 161.0]])
         >>> td = TensorDict(position=here, target_position=there, heading=torch.zeros(1, 1))
-        >>> TrueWay()(td)["true_way"].round().int()  # a degree to the east of a vehicle that heads north
+        >>> TrueDisplacement()(td)["true_displacement"].round().int()  # a degree to the east, heading north
         tensor([[  0, 111]], dtype=torch.int32)
     """
 
     default_in_keys = ("position", "target_position", "heading")
-    default_out_keys = ("true_way",)
+    default_out_keys = ("true_displacement",)
 
     def _compute(self, values: list[Tensor]) -> list[Tensor]:
         position, target, heading = values
         distance_km, bearing = geodesic(*position.unbind(-1), *target.unbind(-1))
         angle = bearing - heading.squeeze(-1)
-        way = distance_km.unsqueeze(-1) * torch.stack((torch.cos(angle), torch.sin(angle)), -1)
-        return [way.to(heading.dtype)]
+        displacement = distance_km.unsqueeze(-1) * torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+        return [displacement.to(heading.dtype)]
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the displacement, unbounded."""
@@ -78,12 +78,12 @@ class ProgressReward(StepReward):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> after = TensorDict(true_way=torch.tensor([30.0, 40.0]), success=torch.tensor([True]))
-        >>> ProgressReward()(TensorDict(true_way=torch.tensor([60.0, 80.0]), next=after))["next", "reward"]
+        >>> after = TensorDict(true_displacement=torch.tensor([30.0, 40.0]), success=torch.tensor([True]))
+        >>> ProgressReward()(TensorDict(true_displacement=torch.tensor([60.0, 80.0]), next=after))["next", "reward"]
         tensor([10.9000])
     """
 
-    default_in_keys = ("true_way", "success")
+    default_in_keys = ("true_displacement", "success")
 
     @property
     def state_keys(self) -> list[NestedKey]:
@@ -112,12 +112,12 @@ class HighestSPL(StatefulTransform):
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueWay(), HighestSPL()))
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueDisplacement(), HighestSPL()))
         >>> bool((env.rollout(3)["next", "highest_spl"] < 1).all())
         True
     """
 
-    default_in_keys = ("true_way", "move", "start_position", "target_position", "success", "done")
+    default_in_keys = ("true_displacement", "leg", "start_position", "target_position", "success", "done")
     default_out_keys = ("highest_spl",)
     out_sizes = {"highest_spl": (1,)}
 
@@ -132,9 +132,9 @@ class HighestSPL(StatefulTransform):
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         after, (before, highest) = self._named(values), state
         start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
-        task_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["move"].dtype)
-        path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + after["move"][..., :1]
-        whole_km = torch.where(success, path_km, path_km + after["true_way"].norm(dim=-1, keepdim=True))
+        task_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
+        path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + after["leg"][..., :1]
+        whole_km = torch.where(success, path_km, path_km + after["true_displacement"].norm(dim=-1, keepdim=True))
         reached = task_km / torch.maximum(whole_km, task_km)
         tensordict.set(self.out_keys[0], torch.where(after["done"] & ~success, torch.zeros_like(reached), reached))
 
@@ -261,12 +261,12 @@ class DistanceCost(StepReward):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> step = TensorDict(next=TensorDict(move=torch.tensor([40.0, 0.1]), reward=torch.tensor([3.0])))
+        >>> step = TensorDict(next=TensorDict(leg=torch.tensor([40.0, 0.1]), reward=torch.tensor([3.0])))
         >>> DistanceCost(0.05)(step)["next", "reward"]
         tensor([1.])
     """
 
-    default_in_keys = ("move",)
+    default_in_keys = ("leg",)
     state_keys = ()
 
     def __init__(self, cost: float, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:

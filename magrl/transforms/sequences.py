@@ -14,8 +14,8 @@ from magrl.field.elements import element_difference
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms.base import StatefulTransform
 
-_MOVE_KM = 50.0
-_LEAST_MOVE_KM = 0.5
+_LEG_KM = 50.0
+_LEAST_LEG_KM = 0.5
 _DIFFERENCE_NT = 2000.0
 _RATE = 1.25  # unit of a change [nT/km]
 _LEAST_NT = 1000.0  # of the horizontal intensity; below, small angles no longer hold
@@ -63,7 +63,7 @@ class ReadingObservation(StatefulTransform):
         torch.Size([2, 3, 26])
     """
 
-    default_in_keys = ("field", "target_field", "move", "heading")
+    default_in_keys = ("field", "target_field", "leg", "heading")
     default_out_keys = ("observation",)
     optional_in_keys = ACCURACY_KEYS
     bounds = READING_BOUNDS
@@ -78,9 +78,9 @@ class ReadingObservation(StatefulTransform):
         self._advance(tensordict, values, values[:1])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        reading, target, move, heading, *accuracy = values
+        reading, target, leg, heading, *accuracy = values
         stds = accuracy or [torch.zeros_like(reading)] * len(ACCURACY_KEYS)
-        observed = observed_reading(reading, target, move[..., :1], heading, stds, state[0])
+        observed = observed_reading(reading, target, leg[..., :1], heading, stds, state[0])
         tensordict.set(self.out_keys[0], observed)
 
 
@@ -109,7 +109,7 @@ def observed_reading(
     """
     unit = per_nanotesla(reading)
     left = element_difference(target, reading) / unit / _DIFFERENCE_NT
-    rate = element_difference(reading, before) / unit / moved.clamp_min(_LEAST_MOVE_KM) / _RATE
+    rate = element_difference(reading, before) / unit / moved.clamp_min(_LEAST_LEG_KM) / _RATE
     along, steep, far = ((a * b).sum(-1, keepdim=True) for a, b in ((left, rate), (rate, rate), (left, left)))
     observed = (
         features(reading, target),
@@ -118,7 +118,7 @@ def observed_reading(
         along / (steep * far + 1e-6).sqrt(),
         torch.cos(heading),
         torch.sin(heading),
-        moved / _MOVE_KM,
+        moved / _LEG_KM,
         *(torch.asinh(std / unit / _NOISE_NT).clamp(max=_FARTHEST) for std in accuracy),
     )
     return torch.cat(observed, -1)

@@ -16,14 +16,14 @@ from magrl.checks import check_choice, check_type
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import Reading, Rules, Track, advance, begin, declaring
 from magrl.tracking.belief import LocalElements
+from magrl.tracking.displacement import DestinationPosterior, Displacement
 from magrl.tracking.observation import OBSERVATION_SIZE, TRACK_BOUNDS
 from magrl.tracking.pilot import observation
 from magrl.tracking.records import State
-from magrl.tracking.way import DestinationPosterior, Way
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
 from magrl.transforms.errors.known import PLACE_KEYS
 
-READ_KEYS = ("field", "target_field", "move", "heading", "elapsed_steps")
+READ_KEYS = ("field", "target_field", "leg", "heading", "elapsed_steps")
 """Keys that a track reads at each step."""
 KNOWN_KEYS = (*STD_KEYS, *PLACE_KEYS, "step_price")
 """Keys that it reads where an environment has them: the accuracy of readings, known places, a price."""
@@ -37,7 +37,7 @@ def reading_of(seen: TensorDictBase) -> Reading:
         >>> reading_of(GeomagneticNavEnv(num_envs=2, seed=0).reset()).distance
         tensor([0., 0.])
     """
-    field, target, move, heading, step = (seen[key] for key in READ_KEYS)
+    field, target, leg, heading, step = (seen[key] for key in READ_KEYS)
     std = SensorStd(*(seen.get(key, torch.zeros_like(field)).double() for key in STD_KEYS))
     price = seen.get("step_price", None)
     known = {
@@ -45,12 +45,12 @@ def reading_of(seen: TensorDictBase) -> Reading:
         "place": seen.get("start_place", None),
         "target_place": seen.get("target_place", None),
     }
-    return Reading(field, target, move[..., 0], heading.squeeze(-1), std, step.squeeze(-1), **known)
+    return Reading(field, target, leg[..., 0], heading.squeeze(-1), std, step.squeeze(-1), **known)
 
 
 def track_of(record: TensorDictBase) -> Track:
     """Return the track that :class:`TrackField` keeps under its first key."""
-    parts = {"state": State, "posterior": DestinationPosterior, "way": Way, "local": LocalElements}
+    parts = {"state": State, "posterior": DestinationPosterior, "displacement": Displacement, "local": LocalElements}
     return Track(*(parts[name](**record[name]) if name in parts else record[name] for name in Track._fields[:-1]))
 
 
@@ -58,9 +58,9 @@ class TrackField(StatefulTransform):
     """Keep the track of a vehicle by its own readings: the pilot of :mod:`magrl.tracking.pilot` as a transform.
 
     The nested key ``track`` has the state (float64, which a step reads from the TensorDict before it), the posterior of
-    the displacement to the destination, its mean and covariance ``("track", "way", ...)`` [km], elements and gradients
-    ``("track", "local", ...)``, the aim and the planned leg ``(..., 2)`` [km]. ``observation``, which may be left out,
-    is what a network observes that corrects the plan. Nothing that it writes is privileged unless an input is.
+    the displacement to the destination, its mean and covariance ``("track", "displacement", ...)`` [km], elements and
+    gradients ``("track", "local", ...)``, the aim and the planned leg ``(..., 2)`` [km]. ``observation``, which may be
+    left out, is what a network observes that corrects the plan. Nothing it writes is privileged unless an input is.
 
     Args:
         rules: what the vehicle knows before it starts.
@@ -77,7 +77,7 @@ class TrackField(StatefulTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from torchrl.envs import TransformedEnv
         >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), TrackField(Rules()))
-        >>> env.rollout(5)["next", "track", "way", "displacement"].shape
+        >>> env.rollout(5)["next", "track", "displacement", "mean"].shape
         torch.Size([2, 5, 2])
     """
 

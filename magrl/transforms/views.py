@@ -20,7 +20,7 @@ from magrl.transforms.base import Keys, ObservationTransform
 from magrl.transforms.legs import Fix, RecentLegs
 from magrl.transforms.scaling import MinMaxNorm
 
-READING_SIZES = {"field": 3, "target_field": 3, "move": 2, "heading": 1, "elapsed_steps": 1}
+READING_SIZES = {"field": 3, "target_field": 3, "leg": 2, "heading": 1, "elapsed_steps": 1}
 """Numbers of the public keys of a step."""
 
 
@@ -103,11 +103,11 @@ class TargetDifference(ObservationTransform):
 class _View:
     """Base class of views: the limits of actions and their scaling."""
 
-    max_move_km: float
+    max_leg_km: float
     max_turn_rad: float
 
     def __post_init__(self) -> None:
-        check_number(0, above=True, max_move_km=self.max_move_km)
+        check_number(0, above=True, max_leg_km=self.max_leg_km)
         check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
 
     def needed(self, env: EnvBase) -> list[Transform]:  # noqa: ARG002
@@ -126,7 +126,7 @@ class _View:
         return MinMaxNorm(in_keys_inv=["action"], bounds={"action": (low, high)})
 
     def _action_bounds(self) -> tuple[Tensor, Tensor]:
-        high = torch.tensor((self.max_move_km, self.max_turn_rad))
+        high = torch.tensor((self.max_leg_km, self.max_turn_rad))
         return high * torch.tensor((0, -1)), high
 
 
@@ -141,7 +141,7 @@ class ObservationView(_View):
         observe_areas: whether no-go areas in sight are observed (:class:`~magrl.transforms.NoGoAreas`).
         field_low: D [deg], I [deg], B_H [nT] that are scaled to -1.
         field_high: D [deg], I [deg], B_H [nT] that are scaled to 1.
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
@@ -150,7 +150,7 @@ class ObservationView(_View):
 
     Example:
         >>> view = ObservationView(observe_heading=True, observe_difference=True, field_low=(8.0, -40.0, 33000.0),
-        ...                        field_high=(12.0, -10.0, 37000.0), max_move_km=50.0, max_turn_rad=1.5)
+        ...                        field_high=(12.0, -10.0, 37000.0), max_leg_km=50.0, max_turn_rad=1.5)
         >>> view.size
         13
     """
@@ -173,7 +173,7 @@ class ObservationView(_View):
     def in_keys(self) -> tuple[str, ...]:
         """Keys of the environment that are observed."""
         switched = (*(("heading",) if self.observe_heading else ()), *(("areas",) if self.observe_areas else ()))
-        return ("field", "target_field", "move", *switched)
+        return ("field", "target_field", "leg", *switched)
 
     @property
     def size(self) -> int:
@@ -183,8 +183,8 @@ class ObservationView(_View):
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys to ``observation`` ``(..., size)``."""
         low, high = torch.tensor(self.field_low), torch.tensor(self.field_high)
-        keys = ["field", "target_field", "move"]
-        bounds = {"field": (low, high), "target_field": (low, high), "move": self._action_bounds()}
+        keys = ["field", "target_field", "leg"]
+        bounds = {"field": (low, high), "target_field": (low, high), "leg": self._action_bounds()}
         steps: list[Transform] = []
         if self.observe_difference:
             # A quarter of the region's range is about the change over a path across half of it.
@@ -238,14 +238,14 @@ class LegsView(_View):
     Args:
         count: number of legs.
         max_steps: steps of an episode.
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
         ValueError: for a count or a number of steps below 1, or a leg or a turn out of range.
 
     Example:
-        >>> LegsView(max_steps=60, max_move_km=25.0, max_turn_rad=1.5).size
+        >>> LegsView(max_steps=60, max_leg_km=25.0, max_turn_rad=1.5).size
         45
     """
 
@@ -286,18 +286,18 @@ class ReadingView(_View):
 
     Args:
         keys: observed keys, in the order of their numbers: among :data:`READING_SIZES`.
-        max_move_km: longest leg [km].
+        max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:
         ValueError: for other keys, or a leg or a turn out of range.
 
     Example:
-        >>> ReadingView(max_move_km=50.0, max_turn_rad=1.5).size
+        >>> ReadingView(max_leg_km=50.0, max_turn_rad=1.5).size
         9
     """
 
-    keys: Sequence[str] = ("field", "target_field", "move", "heading")
+    keys: Sequence[str] = ("field", "target_field", "leg", "heading")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -311,7 +311,7 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     if not _measured(readings):
         texts += [] if date is None else _compass_mistakes(elements[:, 0], expected[:, 0])
         readings = readings.assign(heading=readings["heading"] + (expected - elements)[:, 0].numpy())
-    return texts + _move_mistakes(readings, place[:, :2], expected[:, 0])
+    return texts + _leg_mistakes(readings, place[:, :2], expected[:, 0])
 
 
 def _tensor(readings: DataFrame, *names: str) -> Tensor:
@@ -360,7 +360,7 @@ def _measured(readings: DataFrame) -> bool:
     return "D_std" not in readings or bool((readings["D_std"] < OUTAGE_STD).any())
 
 
-def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> list[str]:
+def _leg_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> list[str]:
     """Return the likely mistakes in the unit of the distances and in the north of the headings."""
     distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
     moved, heading = _tensor(readings, "distance", "heading")[1:].unbind(-1)

@@ -7,14 +7,14 @@ import torch
 from tensordict import TensorDict
 
 from magrl.agents import make_actor
-from magrl.agents.networks import AreaGeometry, CorrectedMove
+from magrl.agents.networks import AreaGeometry, CorrectedLeg
 from magrl.tracking import Rules
 from magrl.transforms import NoGoAreas
 from magrl.transforms.areas import distance_km
 
 
 def test_new_actor_is_not_saturated() -> None:
-    """Half the longest move and no turn, give or take what the weights add."""
+    """Half the longest leg and no turn, give or take what the weights add."""
     torch.manual_seed(0)
     actions = make_actor(13, (16, 16))(TensorDict(observation=2 * torch.rand(50, 13) - 1, batch_size=[50]))["action"]
     assert actions.abs().max() < 0.95
@@ -22,8 +22,8 @@ def test_new_actor_is_not_saturated() -> None:
 
 
 def test_a_correction_scales_and_turns_the_plan() -> None:
-    """Up to the longest move; where the turn is too large, the vehicle turns where it is."""
-    corrected = CorrectedMove(Rules())
+    """Up to the longest leg; where the turn is too large, the vehicle turns where it is."""
+    corrected = CorrectedLeg(Rules())
     planned = torch.tensor([[20.0, 0.0], [20.0, 0.0], [0.0, 40.0], [-10.0, 0.0]])
     change = torch.tensor([[0.0, 1.0], [2 * math.log(2.0), 0.0], [2.0, -math.pi], [0.0, -0.1]])
     expected = torch.tensor([[-0.2, 1 / math.pi], [0.6, 0.0], [1.0, 0.0], [-1.0, 1.0]])

@@ -26,7 +26,7 @@ from magrl.transforms import ReadingView, SensorErrors
 from magrl.vehicle.onboard import Onboard
 
 NOISE = (0.05, 0.05, 5.0)
-LIMITS = {"max_move_km": 50.0, "max_turn_rad": math.pi / 2}
+LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}
 READINGS = ReadingView(**LIMITS)
 
 
@@ -56,7 +56,7 @@ def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) 
     assert actor.training
     assert with_paths(tmp_path) == []
     policy = load_policy(tmp_path / "own.onnx")
-    assert (policy.view, policy.in_keys) == (view, ["field", "target_field", "move", "heading", "elapsed_steps"])
+    assert (policy.view, policy.in_keys) == (view, ["field", "target_field", "leg", "heading", "elapsed_steps"])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         wanted = evaluation_rollout(env, actor)
     found = evaluation_rollout(plain_env(max_steps=8), policy)
@@ -110,14 +110,14 @@ def test_a_policy_flies_on_board(own: Path, tmp_path: Path) -> None:
     state, vehicle = env.reset(), Onboard(policy, max_steps=50, radius_km=5.0)
     vehicle.start(state["target_field"][0].tolist())
     for step in range(5):
-        seen = *state["field"][0].tolist(), math.degrees(state["heading"].item()), state["move"][0, 0].item()
+        seen = *state["field"][0].tolist(), math.degrees(state["heading"].item()), state["leg"][0, 0].item()
         command, (distance, turn) = vehicle.step(*seen), policy(state)["action"][0].tolist()
         assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
         state = env.step(state)["next"]
         if step == 3:
-            vehicle.save(tmp_path / "way.pt")
+            vehicle.save(tmp_path / "flight.pt")
             vehicle = Onboard(load_policy(own), max_steps=50, radius_km=5.0)
-            vehicle.restore(tmp_path / "way.pt")
+            vehicle.restore(tmp_path / "flight.pt")
 
 
 def test_a_policy_of_three_numbers_declares_its_arrival(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_damaged_files_are_refused(own: Path, tmp_path: Path) -> None:
         (described(lambda _: {}), ""),
         (described(lambda content: content | {"format": 7}), ""),
         (described(lambda content: content | {"kind": "map"}), ""),
-        (described(lambda content: content | {"view": {"max_move_km": -1}}), ""),
+        (described(lambda content: content | {"view": {"max_leg_km": -1}}), ""),
         (lambda model: model.ClearField("metadata_props"), r"by save_policy\('policy.onnx', FILE, view\)"),
     ):
         model, path = ModelProto.FromString(own.read_bytes()), tmp_path / "changed.onnx"

@@ -26,12 +26,12 @@ def test_actions() -> None:
     assert env.action_spec.shape == (3, 3)
     assert env.action_spec.space.low[0].tolist() == pytest.approx([0.0, -math.pi / 2, -1.0])
     assert env.action_spec.space.high[0].tolist() == pytest.approx([50.0, math.pi / 2, 1.0])
-    assert env.observation_spec["move"].shape == (3, 2)
+    assert env.observation_spec["leg"].shape == (3, 2)
     assert set(env.observation_spec.keys()) - set(paper_env().observation_spec.keys()) == {"declared"}
 
 
 def test_a_declaration_within_the_radius_is_a_success_and_elsewhere_a_false_arrival() -> None:
-    """Moves of 20 km northward to targets 9.9, 10.1, 29.9 and 30.1 km away: 10.1, 9.9, 9.9 and 10.1 km are left."""
+    """Legs of 20 km northward to targets 9.9, 10.1, 29.9 and 30.1 km away: 10.1, 9.9, 9.9 and 10.1 km are left."""
     env = near(9.9, 10.1, 29.9, 30.1, 29.9, 20.0)
     declare = torch.tensor([1.0, 0.5, 1.0, 0.001, 0.0, -1.0])
     action = torch.stack((torch.full((6,), 20.0), torch.zeros(6), declare), -1)
@@ -41,7 +41,7 @@ def test_a_declaration_within_the_radius_is_a_success_and_elsewhere_a_false_arri
     assert torch.equal(after["terminated"], after["declared"])
     assert torch.equal(after["done"], after["declared"])
     assert after["reward_destination"].squeeze(-1).tolist() == [0, 200, 200, 0, 0, 0]
-    assert torch.equal(after["move"], action[:, :2])
+    assert torch.equal(after["leg"], action[:, :2])
 
 
 def test_the_objective_ends_no_episode() -> None:
@@ -58,7 +58,7 @@ def test_the_objective_ends_no_episode() -> None:
 
 
 def test_an_arrival_by_distance_ends_the_episode_within_the_radius() -> None:
-    """Moves of 20 km northward to targets 9.9, 10.1, 29.9 and 30.1 km away: 10.1, 9.9, 9.9 and 10.1 km are left."""
+    """Legs of 20 km northward to targets 9.9, 10.1, 29.9 and 30.1 km away: 10.1, 9.9, 9.9 and 10.1 km are left."""
     env = near(9.9, 10.1, 29.9, 30.1, rule="distance")
     assert env.action_spec.shape == (4, 2)
     after = env.step(env.reset().set("action", torch.tensor([[20.0, 0.0]]).expand(4, 2)))["next"]

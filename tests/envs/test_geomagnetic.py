@@ -1,4 +1,4 @@
-"""The environment: specs, one move by hand, rewards, ends of episodes, seeds, independent vehicles, options, tracks."""
+"""The environment: specs, one leg by hand, rewards, ends of episodes, seeds, independent vehicles, options, tracks."""
 
 import copy
 import math
@@ -50,7 +50,7 @@ def moved(place: tuple[float, float], heading: float, distance_km: float) -> tup
 
 
 def fly(env: GeomagneticNavEnv, *actions: tuple[float, float] | Tensor) -> list[TensorDictBase]:
-    """The transitions of some moves, each the same for all vehicles or one row a vehicle; nobody is reset."""
+    """The transitions of some legs, each the same for all vehicles or one row a vehicle; nobody is reset."""
     td, steps = env.reset(), []
     for action in actions:
         steps.append(env.step(td.set("action", torch.as_tensor(action).expand(env.num_envs, 2).clone())))
@@ -86,12 +86,12 @@ def assert_same(a: TensorDictBase, b: TensorDictBase, but: tuple[str, ...] = ())
 @pytest.mark.parametrize(
     "options",
     [
-        {"num_envs": 64, "max_turn_deg": 180.0, "max_move_km": 300.0, "start_heading": "random"},
+        {"num_envs": 64, "max_turn_deg": 180.0, "max_leg_km": 300.0, "start_heading": "random"},
         {"max_steps": 1, "drift_km": 10.0},
         {"region": ANTIMERIDIAN, "generation": 14, "arrival": "declared"},
         {"region": Region((-80.0, -70.0), (-10.0, 40.0)), "field": IGRF(2027.0), "arrival": "distance"},
     ],
-    ids=["long moves", "one step", "antimeridian", "IGRF itself"],
+    ids=["long legs", "one step", "antimeridian", "IGRF itself"],
 )
 def test_specs_match_the_data(options: dict[str, Any]) -> None:
     check_env_specs(make(**{"num_envs": 3} | options), break_when_any_done="both")
@@ -116,7 +116,7 @@ def test_a_collector_cuts_episodes() -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One move by hand, between the paper's example points
+# One leg by hand, between the paper's example points
 
 START, TARGET = (-2.0, 162.0), (-8.0, 164.0)
 
@@ -136,22 +136,22 @@ def test_first_observation_is_that_of_the_paper() -> None:
         assert ((td[key] - torch.tensor(values)).abs() < torch.tensor([0.002, 0.002, 1.5])).all(), key
     assert td["position"].tolist() == td["start_position"].tolist() == list(START)
     assert td["target_position"].tolist() == list(TARGET)
-    assert td["objective"].item() == pytest.approx(3.0, rel=1e-6)  # each element is the whole of its way off
+    assert td["objective"].item() == pytest.approx(3.0, rel=1e-6)  # each element is the whole of its difference off
     weights = 1 / (elements_by_ppigrf(*TARGET) - elements_by_ppigrf(*START)).square()
     assert td["objective_weights"].tolist() == pytest.approx(weights.tolist(), rel=1e-5)
     assert td["heading"].item() == td["elapsed_steps"].item() == 0
-    assert td["move"].tolist() == [0.0, 0.0]
+    assert td["leg"].tolist() == [0.0, 0.0]
     assert not td["success"]
     assert not td["done"]
 
 
-def test_one_move_by_hand() -> None:
+def test_one_leg_by_hand() -> None:
     turn, end = -3 * math.pi / 4, (-2.3197057250399222, 161.68214048662887)  # 50 km, by GeographicLib 2.1
     (step,) = fly(make(tasks=task(START, TARGET), max_turn_deg=180.0), (50.0, turn))
     after = step["next"][0]
     assert after["position"].tolist() == pytest.approx(end, abs=1e-7)  # a centimeter
     assert after["heading"].item() == pytest.approx(turn, abs=1e-6)
-    assert after["move"].tolist() == pytest.approx([50.0, turn], abs=1e-6)
+    assert after["leg"].tolist() == pytest.approx([50.0, turn], abs=1e-6)
     assert after["elapsed_steps"].item() == 1
 
     origin, here, there = (elements_by_ppigrf(*place) for place in (START, end, TARGET))
@@ -163,7 +163,7 @@ def test_one_move_by_hand() -> None:
 
 
 def test_late_rewards_decay() -> None:
-    """Past half of 6 moves, n/6 of the size of the proximity term is taken off: gains shrink and losses grow."""
+    """Past half of 6 legs, n/6 of the size of the proximity term is taken off: gains shrink and losses grow."""
     turn_back, go_on, stay = (50.0, math.pi), (50.0, 0.0), (0.0, 0.0)
     env = make(tasks=task(START, TARGET), max_steps=6, max_turn_deg=180.0, proximity_weight=2.5)
     steps = fly(env, turn_back, stay, go_on, turn_back, turn_back, go_on)  # south, south, north, south, south
@@ -188,7 +188,7 @@ HERE = (-5.0, 165.0)
 
 
 def test_the_threshold_is_zeta() -> None:
-    """A move that falls short of it by a little arrives only if zeta is that wide."""
+    """A leg that falls short of it by a little arrives only if zeta is that wide."""
     tasks = task(HERE, moved(HERE, 0.0, 45.0))
     left = fly(make(tasks=tasks), (40.0, 0.0))[0]["next", "objective"].item()
     assert left > 0.001
@@ -196,7 +196,7 @@ def test_the_threshold_is_zeta() -> None:
         assert fly(make(tasks=tasks, zeta=zeta), (40.0, 0.0))[0]["next", "success"].item() is success
 
 
-def test_arriving_with_the_last_move_is_an_end_and_not_a_cut() -> None:
+def test_arriving_with_the_last_leg_is_an_end_and_not_a_cut() -> None:
     """And the reward at arrival is not decayed, only the proximity term is, here to nothing."""
     env = make(tasks=task(HERE, moved(HERE, 0.0, 40.0)), max_steps=1, destination_weight=77.0)
     after = fly(env, (40.0, 0.0))[0]["next"]
@@ -355,7 +355,7 @@ def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
     env = make(3)
     after = fly(env, actions)[0]["next"]
     low, high = env.action_spec.space.low, env.action_spec.space.high
-    assert ((after["move"] >= low) & (after["move"] <= high)).all()
+    assert ((after["leg"] >= low) & (after["leg"] <= high)).all()
     assert env.observation_spec.is_in(after.select(*PUBLIC_KEYS, *PRIVILEGED_KEYS, "elapsed_steps"))
 
 
@@ -372,7 +372,7 @@ def test_a_field_that_is_moved_stays_where_it_was_in_the_scenario() -> None:
 def test_options_replace_those_of_the_scenario() -> None:
     scenario = Scenario(max_steps=80, zeta=0.02)
     env = GeomagneticNavEnv(scenario, zeta=0.5, max_turn_deg=60, arrival="distance", radius_km=30)
-    assert (env.max_steps, env.zeta, env.max_move_km, env.start_heading) == (80, 0.5, 50.0, "north")
+    assert (env.max_steps, env.zeta, env.max_leg_km, env.start_heading) == (80, 0.5, 50.0, "north")
     assert (env.max_turn_rad, env.arrival, env.scenario.radius_km) == (math.radians(60), "distance", 30.0)
     assert (env.scenario.max_steps, env.scenario.zeta, scenario.zeta) == (80, 0.5, 0.02)
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'speed'; the options are .*'max_steps'"):

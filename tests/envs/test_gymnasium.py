@@ -110,7 +110,7 @@ def test_starts_without_a_map() -> None:
 
 
 def test_one_vehicle_without_a_map_reads_its_sensors_alone() -> None:
-    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
+    keys = ("field", "target_field", "leg", "heading", "sensor_std", "bias_std")
     planets = planet_scenario(3, seed=0)
     env = gymnasium.make(ANYWHERE_ID, scenario=planets, observation=keys, transforms=[NOISE])
     observation, _ = env.reset(seed=0)
@@ -158,7 +158,7 @@ def test_tasks_for_a_memory_show_readings_alone(task: str) -> None:
     envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{task.title()}-v1", num_envs=40, scenario=planets)
     assert envs.reset(seed=0)[0].shape == (40, 26)
     state = envs.unwrapped.torchrl_env.rollout(8, break_when_any_done=False)
-    assert not {"way", "planned_move", "belief_mean"} & set(state.keys())
+    assert not {"displacement", "planned_leg", "belief_mean"} & set(state.keys())
     error = (state["field"] - state["true_field"])[..., 2]
     told = torch.hypot(state["sensor_std"], state["bias_std"])[..., 2]
     assert (error.square().mean() > 9 * told.square().mean()) == (task == "storm")

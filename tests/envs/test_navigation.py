@@ -20,7 +20,7 @@ def test_rewards() -> None:
     states = [navigation_env(3, seed=1).reset()]
     states += [navigation_env(3, reward=reward, seed=1).reset() for reward in ("paper", "base", "spl")]
     assert ["gradient_heading" in state for state in states] == [False, True, False, False]
-    assert ["true_way" in state for state in states] == [True, False, False, True]
+    assert ["true_displacement" in state for state in states] == [True, False, False, True]
     assert all(torch.equal(states[0]["observation"], state["observation"]) for state in states)
 
 
@@ -41,7 +41,7 @@ def returns(env: TransformedEnv, policy: Callable[[TensorDict], TensorDict]) -> 
 
 
 def test_no_episode_without_an_arrival_earns_as_much_as_the_worst_arrival() -> None:
-    """Standing still, turning on the spot, and every constant action, beside arrivals after 25 random moves."""
+    """Standing still, turning on the spot, and every constant action, beside arrivals after 25 random legs."""
     grid = torch.cartesian_prod(torch.linspace(-1, 1, 5), torch.linspace(-1, 1, 17))
     constant = navigation_env(2 * len(grid), seed=0)
     earned, lucky = returns(constant, lambda state: state.set("action", grid.repeat(2, 1)))
@@ -76,6 +76,6 @@ def test_guidance_is_by_the_truth_and_a_compose_is_the_list_of_its_parts() -> No
 
 
 def test_the_observation_of_the_recipes_is_added_to_own_ones() -> None:
-    joined = CatTensors(["field", "move"], "both", del_keys=False)
+    joined = CatTensors(["field", "leg"], "both", del_keys=False)
     state = navigation_env(2, transforms=[joined], seed=0).reset()
     assert (state["observation"].shape, state["both"].shape) == ((2, 13), (2, 5))

@@ -119,14 +119,14 @@ REACH = [
 ]
 
 
-@pytest.mark.parametrize(("region", "max_move_km"), REACH)
-def test_reachable_holds_every_place_that_a_move_can_reach(region, max_move_km):
+@pytest.mark.parametrize(("region", "max_leg_km"), REACH)
+def test_reachable_holds_every_place_that_a_leg_can_reach(region, max_leg_km):
     """From the edge in any direction."""
     heading = torch.linspace(-math.pi, math.pi, 73, dtype=torch.float64)
     side = Regions.of(region).grid(41)[0]
     rim = torch.cat((side[0], side[-1], side[:, 0], side[:, -1]))
-    reached = torch.stack(move(*rim.unsqueeze(1).unbind(-1), heading, f64(max_move_km)), -1)
-    assert Regions.of(region).reachable(max_move_km).contains(reached).all()
+    reached = torch.stack(move(*rim.unsqueeze(1).unbind(-1), heading, f64(max_leg_km)), -1)
+    assert Regions.of(region).reachable(max_leg_km).contains(reached).all()
 
 
 def test_no_distance_exceeds_the_longest():
@@ -167,7 +167,7 @@ def make(num_envs: int = 64, scenario: Scenario | None = None, **options: Any) -
 
 
 def fly(env: GeomagneticNavEnv, steps: int = 30, seed: int = 0) -> TensorDictBase:
-    """Transitions ``(T, N)`` of random moves over several episodes: who is done starts anew."""
+    """Transitions ``(T, N)`` of random legs over several episodes: who is done starts anew."""
     draws = torch.rand(steps, env.num_envs, 2, generator=torch.Generator().manual_seed(seed))
     td, found = env.reset(), []
     for draw in draws:
@@ -276,7 +276,7 @@ def test_regions_of_the_earth() -> None:
     [
         {"half_size_deg": 30.0},
         {"tolerance_nt": 1e-6},
-        pytest.param({"crust": True, "max_move_km": 500.0}, marks=pytest.mark.slow),
+        pytest.param({"crust": True, "max_leg_km": 500.0}, marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -299,7 +299,7 @@ BAD: list[tuple[Callable[[], object], str]] = [
     (lambda: Scenario(region=planets().region), "region holds 6 boxes, and field 1 expansions"),
     (lambda: Scenario(field=planets().field), "region holds 1 boxes, and field 6 expansions"),
     (lambda: planets().with_tasks(Tasks(*planets().random_tasks(9, seed=0)[:2])), "lies outside Region("),
-    (lambda: make(2, max_move_km=900.0), "the field is not defined on all of Region("),
+    (lambda: make(2, max_leg_km=900.0), "the field is not defined on all of Region("),
 ]
 
 

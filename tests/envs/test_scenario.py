@@ -72,7 +72,7 @@ def test_replace_checks_anew_and_changes_nothing_else() -> None:
     assert framed.with_tasks(None) == scenario
     changed = framed.replace(altitude_km=5)
     assert changed.altitude_km == 5
-    assert [changed.given(name) for name in ("altitude_km", "margin_deg", "max_move_km")] == [5, 3.0, None]
+    assert [changed.given(name) for name in ("altitude_km", "margin_deg", "max_leg_km")] == [5, 3.0, None]
     with pytest.raises(ValueError, match="lies outside"):
         Scenario().with_tasks(tasks)
     with pytest.raises(ValueError, match="frozen"):
@@ -111,7 +111,7 @@ def test_a_region_near_a_pole_is_refused_with_a_remedy_that_works(name: str) -> 
 
 
 BAD_VALUES: list[tuple[str, object, str]] = [
-    ("wings", 0.01, "unknown key 'wings': choose from max_steps, max_move_km, max_turn_deg, zeta"),
+    ("wings", 0.01, "unknown key 'wings': choose from max_steps, max_leg_km, max_turn_deg, zeta"),
     ("distance_range_km", (5000.0, 6000.0), "(5000.0, 6000.0): no two points of Region(latitude=(-10.0, 0.0)"),
     ("date", 2026.0, "2026-01-01T00:00:00 is outside IGRF-13, which is valid from 1900-01-01 to 2025-01-01"),
     ("tasks", torch.zeros(9, 4), "tasks must be Tasks(start, target), each (M, 2) latitude and longitude [deg], got"),
@@ -155,7 +155,7 @@ distance_range_km = [200, 400]
 objective_floors = [0.1, 0.3, 100]
 distance_law = "log"
 max_steps = 80
-max_move_km = 20
+max_leg_km = 20
 max_turn_deg = 45
 zeta = 0.02
 arrival = "distance"
@@ -227,7 +227,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_a_scenario_holds_the_options_of_its_episodes(tmp_path) -> None:
     (tmp_path / "deep.toml").write_text(TOML.replace("altitude_km = 10.0", "altitude_km = -3"), encoding="utf-8")
     env = GeomagneticNavEnv(load_scenario(tmp_path / "deep.toml"), num_envs=3, seed=0)
-    assert (env.max_steps, env.max_move_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
+    assert (env.max_steps, env.max_leg_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
     assert (env.max_turn_rad, env.arrival, env.scenario.radius_km) == (math.pi / 4, "distance", 30.0)
     assert env.action_spec.space.high[0].tolist() == pytest.approx([20.0, math.pi / 4])
     assert env.reset()["heading"].abs().min() > 0
@@ -282,7 +282,7 @@ UNREADABLE: dict[str, tuple[str, bytes]] = {
     "JSON": ("a.json", b"[" * 100_000),
     f"the file holds more than {MAX_FILE_BYTES} bytes": ("a.json", b" " * (MAX_FILE_BYTES + 1)),
     "a scenario file must hold a table, got []": ("a.json", b"[]"),
-    "unknown key 'wings': choose from max_steps, max_move_km, max_turn_deg,": (
+    "unknown key 'wings': choose from max_steps, max_leg_km, max_turn_deg,": (
         "a.json",
         json.dumps(sound() | {"wings": 2}).encode(),
     ),

@@ -65,7 +65,7 @@ def test_elements_at_the_destination_have_the_errors_that_vehicles_state(known: 
 
 def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
     """Twice with the same actions, those of the mode of its distribution."""
-    network = TensorDictModule(lambda move: (0 * move, 0 * move + 2.0), ["move"], ["loc", "scale"])
+    network = TensorDictModule(lambda leg: (0 * leg, 0 * leg + 2.0), ["leg"], ["loc", "scale"])
     policy = ProbabilisticActor(
         network,
         in_keys=["loc", "scale"],
@@ -96,7 +96,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
             evaluate(policy, tasks, **options)
 
 
-@pytest.mark.parametrize("options", [{"arrival": "declared"}, {"max_move_km": 20, "zeta": 0.02}])
+@pytest.mark.parametrize("options", [{"arrival": "declared"}, {"max_leg_km": 20, "zeta": 0.02}])
 def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
     """Within the limits of the environment, which it gets from `evaluate`, or from a loop of one's own."""
     scenario = first_tasks(choose_tasks(None, "paper-100"), 3)
@@ -139,7 +139,7 @@ def test_a_vehicle_without_a_finite_action_stands_still_with_scaled_actions() ->
 
     with pytest.warns(UserWarning, match=r"vehicles \[0, 1\] stopped"):
         rollout = evaluation_rollout(navigation_env(2, seed=0, max_steps=4), broken)
-    assert rollout["next", "move"][..., 0].tolist() == [[37.5, 0, 0, 0]] * 2
+    assert rollout["next", "leg"][..., 0].tolist() == [[37.5, 0, 0, 0]] * 2
 
 
 TOLERANCES = {"heading_mae_deg": 0.2, "heading_rmse_deg": 0.1, "navigation_error_km": 0.1}
@@ -161,7 +161,7 @@ HERE = point(0.0, 0.0)
         pytest.param([(40, 10)], point(45, 10), True, {"smoothness_deg": math.nan, "spl": 1}, id="arrival before it"),
         pytest.param([(0, 0)], point(10, 0), True, NOWHERE, id="arrival without leaving"),
         pytest.param([(50, 0), (30, 180)], point(20, 0), True, {"path_efficiency": 0.25}, id="there and back"),
-        pytest.param([(50, 0), (30, 180)], point(300, 90), False, {"path_efficiency": 0.25}, id="of the way made"),
+        pytest.param([(50, 0), (30, 180)], point(300, 90), False, {"path_efficiency": 0.25}, id="of the distance made"),
         pytest.param([(0, 0)], HERE, True, {"shortest_km": 0, "spl": 1, "navigation_error_km": 0}, id="at the end"),
         pytest.param([(0, 0)], HERE, False, {"shortest_km": 0, "spl": 0, "navigation_error_km": 0}, id="not arrived"),
         pytest.param([(5, 0)], HERE, True, {"shortest_km": 0, "spl": 0, "navigation_error_km": 5}, id="detour"),
@@ -177,14 +177,14 @@ def test_measures_of_episodes_by_hand(legs: list, target: tuple, success: bool, 
 
 def test_legs_have_the_commanded_distance_and_the_true_direction() -> None:
     """The direction of the errors of motion, or else of the north reference, or else the commanded one."""
-    steps = TensorDict(move=torch.tensor([[1.0, 0.0]]), heading=torch.tensor([[0.1]]))
+    steps = TensorDict(leg=torch.tensor([[1.0, 0.0]]), heading=torch.tensor([[0.1]]))
     for key, value, expected in (
         ("heading", 0.1, (1.0, 0.1)),
         ("true_heading", 0.2, (1.0, 0.2)),
         ("true_course", 0.3, (1.0, 0.3)),
-        ("true_move", 4.0, (1.0, 0.3)),
+        ("true_leg", 4.0, (1.0, 0.3)),
     ):
-        steps[key] = torch.full((1, 2 if key == "true_move" else 1), value)
+        steps[key] = torch.full((1, 2 if key == "true_leg" else 1), value)
         assert [value.item() for value in moved(steps)] == pytest.approx(expected)
 
 
@@ -220,7 +220,7 @@ def test_spl_by_hand() -> None:
 
 
 def test_path_measures_take_any_batch() -> None:
-    """One degree of latitude at the equator is 110.5744 km; a twice as long way has half the efficiency."""
+    """One degree of latitude at the equator is 110.5744 km; a twice as long path has half the efficiency."""
     start, end = torch.tensor([0.0, 10.0]).double().expand(3, 1, 2), torch.tensor([1.0, 10.0]).double().expand(3, 1, 2)
     got = path_measures(torch.ones(3, 1) > 0, start, end, end, torch.full((3, 1), 2 * 110.5744))
     expected = {"shortest_km": 110.5744, "navigation_error_km": 0, "spl": 0.5, "path_efficiency": 0.5}

@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.evaluation import episode_measures, evaluation_rollout
-from magrl.evaluation.maps import coastlines, trajectories_figure, way_ellipse
+from magrl.evaluation.maps import coastlines, displacement_ellipse, trajectories_figure
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
 from magrl.transforms import TrackField
@@ -29,7 +29,7 @@ def env() -> GeomagneticNavEnv:
 
 @pytest.fixture(scope="module")
 def flight() -> tuple[TensorDictBase, GeomagneticNavEnv]:
-    """Return three moves of one vehicle across the antimeridian, with estimates of the destination."""
+    """Return three legs of one vehicle across the antimeridian, with estimates of the destination."""
     tasks = Tasks(place(-17, 179.999)[None], place(-14, -172)[None])
     scenario = Scenario(region=Region((-25, -5), (170, 195)), tasks=tasks, objective_floors=None)
     base = GeomagneticNavEnv(scenario, seed=0, max_steps=3)
@@ -75,13 +75,13 @@ def test_a_map_across_the_antimeridian_shows_the_estimates(flight) -> None:
 
 
 @pytest.mark.parametrize("across", [12.0, -12.0])
-def test_ellipse_has_the_covariance_of_the_way(across: float) -> None:
+def test_ellipse_has_the_covariance_of_the_displacement(across: float) -> None:
     """Its points are two standard deviations away from the estimate, in every direction."""
-    here = torch.tensor([10.0, 20.0])
-    way, covariance = torch.tensor([3.0, -4.0]).double(), torch.tensor([[25.0, across], [across, 9.0]]).double()
-    ends = way_ellipse(here, way, covariance)
+    here, displacement = torch.tensor([10.0, 20.0]), torch.tensor([3.0, -4.0]).double()
+    covariance = torch.tensor([[25.0, across], [across, 9.0]]).double()
+    ends = displacement_ellipse(here, displacement, covariance)
     distance, bearing = geodesic(*here.double().expand_as(ends).T, *ends.T)
-    offset = torch.stack((distance * torch.cos(bearing), distance * torch.sin(bearing)), -1) - way
+    offset = torch.stack((distance * torch.cos(bearing), distance * torch.sin(bearing)), -1) - displacement
     size = (offset @ covariance.inverse() * offset).sum(-1)
     assert size.numpy() == pytest.approx(4, abs=0.02)
     assert torch.allclose(ends[0], ends[-1], atol=1e-9)

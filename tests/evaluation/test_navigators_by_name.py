@@ -25,7 +25,7 @@ STD, BIAS = (0.3, 0.0, 3.0), (0.4, 0.1, 4.0)
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=2, seed=0, max_move_km=30.0)
+    return GeomagneticNavEnv(num_envs=2, seed=0, max_leg_km=30.0)
 
 
 def trained(env: GeomagneticNavEnv, folder: Path, **settings: object) -> Path:
@@ -84,18 +84,18 @@ def test_a_path_may_have_the_sign_of_a_label(env: GeomagneticNavEnv, tmp_path: P
 
 
 def test_navigators_are_made_for_their_environment_and_sensors(env: GeomagneticNavEnv) -> None:
-    wrapped = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0, max_move_km=30.0), StepCounter())
+    wrapped = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0, max_leg_km=30.0), StepCounter())
     for name, kind in NAVIGATORS.items():
         navigator = make_navigator(name, wrapped, sensor_std=SensorStd(STD, BIAS))
         assert type(navigator) is kind
-        assert navigator.max_move_km == 30
+        assert navigator.max_leg_km == 30
     assert make_navigator("secant", env, sensor_std=SensorStd(STD, BIAS)).probe_km == probe_length(STD)
     assert [make_navigator("ga", env, seed=seed).seed for seed in (3, 4)] == [3, 4]
 
 
 def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
     """Its network may be none of the library: this one turns right and moves by 30 km."""
-    view = ReadingView(keys=["elapsed_steps"], max_move_km=30.0, max_turn_rad=1.5)
+    view = ReadingView(keys=["elapsed_steps"], max_leg_km=30.0, max_turn_rad=1.5)
     save_policy(tmp_path / "policy.onnx", network_file(tmp_path, 1, bias=20.0), view)
     for text in (f"right={tmp_path / 'policy.onnx'}", str(tmp_path / "policy.onnx"), f"{tmp_path}"):
         assert make_navigator(text, env)(env.reset())["action"].tolist() == [[30, 1.5]] * 2
@@ -133,7 +133,7 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
 
 
 def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment() -> None:
-    limits = {"max_move_km": 30, "max_turn_deg": 20, "max_steps": 80, "start_heading": "random"}
+    limits = {"max_leg_km": 30, "max_turn_deg": 20, "max_steps": 80, "start_heading": "random"}
     episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 3), **limits)
     assert episodes["success"].all()
     assert episodes["spl"].mean() > 0.95

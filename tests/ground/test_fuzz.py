@@ -72,7 +72,7 @@ def test_policies(tmp_path: Path) -> None:
 
 def test_networks(tmp_path: Path) -> None:
     """A mutant may be another network, but then it is a valid one."""
-    view = ReadingView(max_move_km=50.0, max_turn_rad=1.5)
+    view = ReadingView(max_leg_km=50.0, max_turn_rad=1.5)
     path = tmp_path / "policy.onnx"
     save_policy(path, network_file(tmp_path, view.size), view)
     fuzz(path, lambda: load_policy(path), lambda found: isinstance(found, FieldPolicy), 5)

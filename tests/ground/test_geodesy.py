@@ -1,4 +1,4 @@
-"""Positions, moves, distances and bearings, against closed forms and against GeographicLib."""
+"""Positions, legs, distances and bearings, against closed forms and against GeographicLib."""
 
 import math
 
@@ -51,7 +51,7 @@ def test_wrapped_angles_are_the_same_in_the_half_open_turn(wrap, half, dtype):
     spread = (unit * 10.0 ** torch.arange(-20, 6, dtype=torch.float64).unsqueeze(-1)).flatten()
     multiples = half / 2 * torch.arange(-400, 401, dtype=torch.float64)
     values = torch.cat((spread, multiples, f64(0.0, -0.0, 1e-40, -1e-40, -1e-300))).to(dtype)
-    values = torch.cat((values, *(torch.nextafter(values, torch.full_like(values, way)) for way in (1e9, -1e9))))
+    values = torch.cat((values, *(torch.nextafter(values, torch.full_like(values, sign)) for sign in (1e9, -1e9))))
     wrapped, edge = wrap(values), torch.tensor(half, dtype=dtype)
     assert wrapped.dtype == dtype
     assert ((wrapped <= edge) & (wrapped > -edge)).all()
@@ -69,7 +69,7 @@ def test_positions_and_their_frames():
     frame, (meridian, across) = local_frame(latitude, longitude), curvature_radii(latitude)
     for row, radius in enumerate((meridian, across * torch.cos(torch.deg2rad(latitude)))):
         step = 1e-3 * torch.eye(2)[row].double()
-        ahead, behind = (to_ecef(latitude + way * step[0], longitude + way * step[1]) for way in (1, -1))
+        ahead, behind = (to_ecef(latitude + sign * step[0], longitude + sign * step[1]) for sign in (1, -1))
         slope = (ahead - behind) / math.radians(2e-3)
         torch.testing.assert_close(slope, radius.unsqueeze(-1) * frame[:, row], rtol=0, atol=1e-4)
     torch.testing.assert_close(torch.linalg.cross(frame[:, 0], frame[:, 1]), frame[:, 2], rtol=0, atol=1e-15)
@@ -160,7 +160,7 @@ def test_nan_gives_nan_and_what_is_off_the_earth_is_named():
 
 
 def test_displacements_by_hand():
-    """3-4-5 triangles, and errors that undo a move or turn it around."""
+    """3-4-5 triangles, and errors that undo a leg or turn it around."""
     distance, heading = torch.tensor([3.0, 5.0, 2.0]), torch.tensor([0.0, math.pi / 2, math.pi])
     error = torch.tensor([[0.0, 4.0], [0.0, -5.0], [3.0, 0.0]])
     moved = displaced(distance, heading, error)

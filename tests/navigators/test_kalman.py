@@ -26,7 +26,7 @@ def env() -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=5, seed=3, start_heading="random")
 
 
-def test_an_untrained_correction_is_the_move_of_kalman() -> None:
+def test_an_untrained_correction_is_the_leg_of_kalman() -> None:
     base = GeomagneticNavEnv(num_envs=10, seed=0, start_heading="random")
     env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0), bias=(0.1, 0.1, 10.0), seed=0))
     agents = Kalman(step_price=2.0), Anywhere(source=correction_network((8,)), step_price=2.0)
@@ -41,9 +41,9 @@ def test_every_navigator_declares(name: str) -> None:
     assert summary["spl"] > 80
 
 
-def test_moves_stay_within_the_limits_of_its_rules() -> None:
+def test_legs_stay_within_the_limits_of_its_rules() -> None:
     env = GeomagneticNavEnv(num_envs=20, seed=0, start_heading="random")
-    agent = Anywhere(max_move_km=10.0, max_turn_deg=math.degrees(0.5))
+    agent = Anywhere(max_leg_km=10.0, max_turn_deg=math.degrees(0.5))
     action = policy_env(env, agent).rollout(2, agent)["action"]
     assert 5 < action[..., 0].max() <= 10 + 1e-4
     assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4
@@ -79,7 +79,7 @@ def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": [1] * 10**5}, r"format \[1, 1, .{70}\.\.\.; this version reads format 4: train it again"),
+        ({"format": [1] * 10**5}, r"format \[1, 1, .{70}\.\.\.; this version reads format 5: train it again"),
         ({"rules": {"max_steps": 0}}, "max_steps"),
         ({"rules": {"speed": 3}}, "speed"),
         ({"num_cells": [10**9]}, "num_cells must be"),

@@ -156,11 +156,11 @@ def test_no_leg_follows_the_end_of_an_episode(env) -> None:
 
 
 @every_algorithm
-def test_a_seed_repeats_the_moves(env, name: str) -> None:
-    moves = []
+def test_a_seed_repeats_the_actions(env, name: str) -> None:
+    actions = []
     for seed in (1, 1, 2):
         env.set_seed(0)  # back to each vehicle's first task
         navigator = NAVIGATORS[name].for_env(env, seed=seed)
-        moves.append(env.rollout(3, navigator, break_when_any_done=False)["action"])
-    assert torch.equal(moves[0], moves[1])
-    assert not torch.equal(moves[0], moves[2])
+        actions.append(env.rollout(3, navigator, break_when_any_done=False)["action"])
+    assert torch.equal(actions[0], actions[1])
+    assert not torch.equal(actions[0], actions[2])

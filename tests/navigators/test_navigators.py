@@ -74,9 +74,9 @@ def test_dead_reckoning_declares_at_the_reckoned_destination() -> None:
 def test_displacement_solves_consistent_equations() -> None:
     """And is finite without a gradient across a line, or any."""
     for elements, shape in (2, ()), (2, (4,)), (3, (2, 3)):
-        jacobian, way = randn(*shape, elements, 2), randn(*shape, 2, seed=1)
-        error = (jacobian @ way.unsqueeze(-1)).squeeze(-1)
-        torch.testing.assert_close(displacement_to(error, jacobian), way, atol=1e-5, rtol=1e-5)
+        jacobian, displacement = randn(*shape, elements, 2), randn(*shape, 2, seed=1)
+        error = (jacobian @ displacement.unsqueeze(-1)).squeeze(-1)
+        torch.testing.assert_close(displacement_to(error, jacobian), displacement, atol=1e-5, rtol=1e-5)
     for dtype, slope in itertools.product((torch.float32, torch.float64), (0, 1)):
         assert (
             displacement_to(torch.tensor([1.0, 2.0], dtype=dtype), torch.full((2, 2), slope, dtype=dtype))
@@ -95,7 +95,7 @@ def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
     for step, position in enumerate(legs.cumsum(0)):
         reading = start + truth @ position
         seen = {"field": reading, "target_field": start + 1, "heading": torch.tensor([turn * (step == 2)])}
-        seen |= {"move": torch.tensor([10.0 * (step > 0), 0.0]), "elapsed_steps": torch.tensor([step])}
+        seen |= {"leg": torch.tensor([10.0 * (step > 0), 0.0]), "elapsed_steps": torch.tensor([step])}
         acted = navigator(TensorDict({**seen, "memory": memory}).unsqueeze(0).auto_batch_size_(1))
         memory = acted["next", "memory"][0]
         found.append(memory["mean"][:, 1:])
@@ -139,7 +139,7 @@ def test_probes_are_longer_where_the_sensors_err() -> None:
     assert probe_length(NOISE) == pytest.approx(5 * (0.05 / 0.015) ** (2 / 3), rel=1e-12)
     assert probe_length((9.0, 0.05, 5.0)) == probe_length(NOISE)
     assert Secant(sensor_std=NOISE, probe_km=3.0).probe_km == 3.0
-    assert Secant(8.0, sensor_std=NOISE).probe_km == 8.0  # no longer than the longest move
+    assert Secant(8.0, sensor_std=NOISE).probe_km == 8.0  # no longer than the longest leg
 
 
 def test_mean_jacobian_needs_no_probes(env) -> None:
@@ -169,7 +169,7 @@ def test_each_navigator_declares_what_it_is() -> None:
 @pytest.mark.parametrize("name", sorted(NAVIGATORS))
 def test_every_navigator_stays_in_bounds_and_reads_what_it_declares(name: str) -> None:
     """Bounds that are not the default; no key is optional."""
-    env = GeomagneticNavEnv(num_envs=3, seed=4, max_move_km=8.0, max_turn_deg=math.degrees(0.7), start_heading="random")
+    env = GeomagneticNavEnv(num_envs=3, seed=4, max_leg_km=8.0, max_turn_deg=math.degrees(0.7), start_heading="random")
     navigator = NAVIGATORS[name].for_env(env)
     env = policy_env(env, navigator)
     state, longest = env.reset(), torch.zeros(())
@@ -188,7 +188,7 @@ def test_every_navigator_stays_in_bounds_and_reads_what_it_declares(name: str) -
 
 @pytest.mark.parametrize("name", ["secant", "kalman", "parallel"])
 def test_declination_continues_across_half_a_turn(env, name: str) -> None:
-    """D from -180 to 180 gives the moves of D without that jump."""
+    """D from -180 to 180 gives the legs of D without that jump."""
 
     class Rotated(Transform):
         """Add 171 degrees to D, which is 8 to 10 degrees there."""
@@ -204,11 +204,11 @@ def test_declination_continues_across_half_a_turn(env, name: str) -> None:
         def _reset(self, _: TensorDict, seen: TensorDict) -> TensorDict:
             return self._call(seen.set("target_field", self._apply_transform(seen["target_field"])))
 
-    moves = []
+    actions = []
     for wrapped in (False, True):
         few = GeomagneticNavEnv(env.scenario, num_envs=8, seed=0, max_steps=4)
-        moves.append(evaluation_rollout(TransformedEnv(few, Rotated(wrapped)), make_navigator(name, few))["action"])
-    torch.testing.assert_close(moves[0], moves[1], rtol=1e-3, atol=1e-3)
+        actions.append(evaluation_rollout(TransformedEnv(few, Rotated(wrapped)), make_navigator(name, few))["action"])
+    torch.testing.assert_close(actions[0], actions[1], rtol=1e-3, atol=1e-3)
 
 
 def test_a_new_episode_begins_a_new_memory_for_its_vehicle_alone(env) -> None:
@@ -230,7 +230,7 @@ def test_secant_stands_a_field_without_change() -> None:
     state = policy_env(GeomagneticNavEnv(num_envs=2, seed=0), navigator).reset()
     for step in range(5):
         state["elapsed_steps"] = torch.full((2, 1), step)
-        state["move"] = torch.tensor([[10.0, 0.0]]).expand(2, 2) * (step > 0)
+        state["leg"] = torch.tensor([[10.0, 0.0]]).expand(2, 2) * (step > 0)
         acted = navigator(state)
         assert torch.isfinite(acted["action"]).all()
         state["memory"] = acted["next", "memory"]
@@ -265,7 +265,7 @@ def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
 
 
 def test_a_reading_that_is_nan_is_not_flown(env) -> None:
-    """A NaN action, which the environment refuses, and not a move by a guess; other vehicles go on."""
+    """A NaN action, which the environment refuses, and not a leg by a guess; other vehicles go on."""
     env.set_seed(0)
     navigator = Secant()
     state = policy_env(env, navigator).rollout(4, navigator)[:, -1]

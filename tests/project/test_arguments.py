@@ -25,7 +25,7 @@ VALUES: dict[str, Any] = {
     **dict.fromkeys(("objective_before", "objective_after"), PLACES),
     **dict.fromkeys(("field", "target_field", "weights", "floors"), torch.ones(4, 2)),
     **dict.fromkeys(("displacement", "error"), torch.zeros(4, 2)),
-    **dict.fromkeys(("radius_km", "max_move_km", "speed_km_h"), 25.0),
+    **dict.fromkeys(("radius_km", "max_leg_km", "speed_km_h"), 25.0),
     **dict.fromkeys(("max_turn_rad", "cost"), 1.5),
     "field_low": (0.0, 0.0, 0.0),
     "field_high": (1.0, 1.0, 1.0),

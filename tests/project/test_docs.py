@@ -55,7 +55,7 @@ BUDGET = {
     '"sac.onnx", "test-1000"': '"sac.onnx", "figure-4-1", max_steps=2',
     "'sb3.onnx', 'test-1000'": "'sb3.onnx', 'figure-4-1', max_steps=2",
     "earth_scenario(64, ": "earth_scenario(2, max_steps=2, ",
-    "max_move_km=50.0, max_steps=120": "max_move_km=50.0, max_steps=2",
+    "max_leg_km=50.0, max_steps=120": "max_leg_km=50.0, max_steps=2",
     "rollout(50, ": "rollout(3, ",
     '(navigator, "paper-100"': '(navigator, "figure-4-1", max_steps=2',
     "random_tasks(24, seed=7)), num_envs=24": "random_tasks(2, seed=7)), max_steps=2, num_envs=2",

@@ -73,7 +73,7 @@ def policy(kind: str, folder: Path) -> TensorDictModuleBase:
     if kind == "feedforward":
         return FieldPolicy(PolicyConfig(env.observation_view(), (8,)))
     if kind == "exported":
-        view = ReadingView(max_move_km=50.0, max_turn_rad=1.5)
+        view = ReadingView(max_leg_km=50.0, max_turn_rad=1.5)
         return export_policy(network_file(folder, view.size), view)
     return make_navigator(kind, env)
 

@@ -20,7 +20,7 @@ def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
 
 
 def test_figures_of_the_example_task() -> None:
-    """The destination is a dashed line in each element; moves are counted from the first."""
+    """The destination is a dashed line in each element; steps are counted from the first."""
     task, values = named_tasks("figure-4-1"), {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0]}
     panels = plots.convergence({"secant": values | {"L": [0.0, 50.0]}}, IGRF("2022-01-01"), task).axes
     assert [len(axes.lines) for axes in panels] == [2, 2, 2, 1]

@@ -35,13 +35,13 @@ def test_specs_of_the_training_environment() -> None:
     assert env.transform[0].seed == 5
 
 
-def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
+def test_critics_see_the_true_displacement_and_the_return_is_the_reward() -> None:
     td = training_env().rollout(4, break_when_any_done=False)["next"]
-    torch.testing.assert_close(td["true_way_scaled"], td["true_way"] / 200)
-    assert 0.4 < td["true_way_scaled"].norm(dim=-1).mean() < 3.0
+    torch.testing.assert_close(td["true_displacement_scaled"], td["true_displacement"] / 200)
+    assert 0.4 < td["true_displacement_scaled"].norm(dim=-1).mean() < 3.0
     torch.testing.assert_close(td["episode_reward"], td["reward"].cumsum(1))
     assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
-    assert recipe.OBSERVED == ("observation", "true_way_scaled", "highest_spl")
+    assert recipe.OBSERVED == ("observation", "true_displacement_scaled", "highest_spl")
 
 
 def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None:
@@ -58,19 +58,19 @@ def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None
 
 
 def test_the_vehicle_is_that_of_the_settings() -> None:
-    config = recipe.FAST.replace(max_move_km=10.0, max_turn_deg=20.0, drift=0.2)
+    config = recipe.FAST.replace(max_leg_km=10.0, max_turn_deg=20.0, drift=0.2)
     planets = planet_scenario(4, seed=3, **config.regions)
     base = GeomagneticNavEnv(planets, num_envs=6, seed=5, drift_km=config.drift_km, **config.rules)
     rules = recipe.rules_of(base, config)
-    assert (rules.max_move_km, math.degrees(rules.max_turn_rad)) == (10.0, pytest.approx(20.0))
+    assert (rules.max_leg_km, math.degrees(rules.max_turn_rad)) == (10.0, pytest.approx(20.0))
     td = recipe.make_env(base, config).rollout(5)["next"]
-    move, true_move = td["move"], td["true_move"]
-    assert (move[..., 1].abs() <= rules.max_turn_rad + 1e-6).all()
-    drift = (true_move - move)[..., 0].abs() / move[..., 0]
+    leg, true_leg = td["leg"], td["true_leg"]
+    assert (leg[..., 1].abs() <= rules.max_turn_rad + 1e-6).all()
+    drift = (true_leg - leg)[..., 0].abs() / leg[..., 0]
     assert 0.05 < drift.max() < 0.2 + 1e-5
-    path_km = true_move[..., 0].cumsum(1)
+    path_km = true_leg[..., 0].cumsum(1)
     task_km = geodesic(*td["start_position"].unbind(-1), *td["target_position"].unbind(-1))[0]
-    best = task_km / (path_km + td["true_way"].norm(dim=-1))
+    best = task_km / (path_km + td["true_displacement"].norm(dim=-1))
     torch.testing.assert_close(td["highest_spl"].squeeze(-1).double(), best.clamp(max=1), rtol=1e-4, atol=1e-4)
 
 

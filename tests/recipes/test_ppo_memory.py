@@ -40,7 +40,7 @@ def test_specs_of_the_training_environment() -> None:
     env = training_env()
     check_env_specs(env, break_when_any_done="both")
     assert env.observation_spec["observation"].shape == (6, READING_SIZE)
-    assert recipe.JUDGED == ("observation", "true_way_scaled", "highest_spl")
+    assert recipe.JUDGED == ("observation", "true_displacement_scaled", "highest_spl")
 
 
 def test_an_agent_acts_as_it_was_trained() -> None:
@@ -49,23 +49,23 @@ def test_an_agent_acts_as_it_was_trained() -> None:
     mean = TensorDictModule(recipe.Joined(trained.correct), list(recipe.KNOWN), ["correction"])
     leg = TensorDictModule(recipe.Leg(), ["estimate", "correction", "heading"], ["action"])
     env = training_env()
-    moves = env.rollout(4, TensorDictSequential(recipe.make_memory(trained), mean, leg), break_when_any_done=False)
+    wanted = env.rollout(4, TensorDictSequential(recipe.make_memory(trained), mean, leg), break_when_any_done=False)
     plain = recipe.task_env(env.base_env.scenario, CONFIG, num_envs=6, seed=5, observation="dict", scale_actions=False)
     flown = policy_env(plain, Memory(trained)).rollout(4, Memory(trained), break_when_any_done=False)
-    assert moves["action"].std() > 0.1
-    torch.testing.assert_close(flown["next", "field"], moves["next", "field"], rtol=1e-4, atol=1e-2)
-    torch.testing.assert_close(flown["next", "move"], moves["next", "move"], rtol=1e-4, atol=1e-2)
+    assert wanted["action"].std() > 0.1
+    torch.testing.assert_close(flown["next", "field"], wanted["next", "field"], rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(flown["next", "leg"], wanted["next", "leg"], rtol=1e-4, atol=1e-2)
 
 
-def test_the_estimate_of_the_true_way_has_no_loss() -> None:
-    """Wherever the vehicles head; a way that is shorter than the longest leg is its own length."""
+def test_the_estimate_of_the_true_displacement_has_no_loss() -> None:
+    """Wherever the vehicles head; a displacement that is shorter than the longest leg is its own length."""
     env, memory = training_env(), recipe.make_memory(network())
     sequences = env.rollout(4, break_when_any_done=False)
-    sequences["true_way"][:3] /= 100
+    sequences["true_displacement"][:3] /= 100
 
     def exact(td: TensorDict) -> None:
-        way, heading = td["true_way"].double(), td["heading"].double()
-        turned = torch.view_as_real(torch.view_as_complex(way) * torch.exp(1j * heading.squeeze(-1)))
+        displacement, heading = td["true_displacement"].double(), td["heading"].double()
+        turned = torch.view_as_real(torch.view_as_complex(displacement) * torch.exp(1j * heading.squeeze(-1)))
         td["estimate"] = (turned / turned.norm(dim=-1, keepdim=True).clamp_min(50.0)).float()
 
     assert recipe.loss_memory(sequences, exact) < 1e-10
@@ -152,6 +152,6 @@ def test_a_file_of_an_agent_holds_its_network_and_no_other(tmp_path) -> None:
 def test_a_memory_keeps_to_shorter_limits() -> None:
     env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random", max_steps=4)
     for limit in (7.0, 90.0):
-        agent = Memory(network(), max_move_km=limit)
-        assert agent.max_move_km == min(limit, 50.0)
+        agent = Memory(network(), max_leg_km=limit)
+        assert agent.max_leg_km == min(limit, 50.0)
         assert evaluation_rollout(env, agent)["action"][..., 0].max() <= min(limit, 50.0) + 1e-4

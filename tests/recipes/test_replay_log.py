@@ -43,7 +43,7 @@ def test_the_example_with_other_columns(tmp_path: Path, monkeypatch, capsys) -> 
     recipe.main([str(tmp_path / "blind.csv"), *NOISE, "--declination", "dec", "--out", str(tmp_path / "b")])
     other = pd.read_csv(tmp_path / "b" / "log.csv")
     assert "miss_km" not in other
-    columns = ["move_km", "steer_deg", "north_km", "error_km", "confidence"]
+    columns = ["leg_km", "steer_deg", "north_km", "error_km", "confidence"]
     pd.testing.assert_frame_equal(table[columns], other[columns])
 
 
@@ -61,7 +61,7 @@ def said(tmp_path: Path, monkeypatch, capsys) -> Callable[..., str]:
 
 
 def test_the_first_position_may_be_known(tmp_path: Path, said) -> None:
-    """The way to the last position, or to another one, is then known from the first row on."""
+    """The displacement to the last position, or to another one, is then known from the first row on."""
     log, start, date = pd.read_csv(LOG)[:6], ("--start-km", 0.5), ("--date", "2025-01-01")
     for options in ((), ("--target-position", 62.5, 1.0)):
         said(log, *start, *date, *options)
@@ -75,7 +75,7 @@ def test_the_first_position_may_be_known(tmp_path: Path, said) -> None:
             said(changed, *start, *options)
 
 
-def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(said) -> None:
+def test_repeated_rows_do_not_double_the_path_and_mistakes_are_named(said) -> None:
     log, date = pd.read_csv(LOG)[:4], ("--date", "2025-01-01")
     text = said(log.loc[log.index.repeat(2)], *date)
     assert "Warning: 4 rows with the time of the row before left out." in text

@@ -22,7 +22,7 @@ def episode(legs: list[tuple[float, float]], target: tuple[float, float], succes
         last = index >= len(legs) - 1
         following = {
             "position": after,
-            "move": torch.tensor([distance, 0.0]),
+            "leg": torch.tensor([distance, 0.0]),
             "heading": heading_rad.float().reshape(1),
             "success": torch.tensor([success and last]),
             "done": torch.tensor([last]),

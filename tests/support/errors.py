@@ -73,7 +73,7 @@ def actions(steps: int, num_envs: int) -> Tensor:
 
 
 def flown(env: EnvBase, steps: Tensor) -> list[TensorDict]:
-    """States of some moves, the first included."""
+    """States of some legs, the first included."""
     states = [env.reset()]
     for action in steps:
         states.append(step_mdp(env.step(states[-1].clone().set("action", action))))

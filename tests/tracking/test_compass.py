@@ -45,17 +45,17 @@ def test_a_reading_leaves_declination_out() -> None:
     assert not local.gradient[0].any()
 
 
-def test_a_move_turns_the_axes_to_magnetic_north_at_its_end() -> None:
+def test_a_leg_turns_the_axes_to_magnetic_north_at_its_end() -> None:
     """The turn depends on the state: the covariance after it is that of samples, and the eastward field stays 0."""
     mean = start(f64(0.0, 55.0, 22000.0), COMPASS).mean
     spread = 1e-2 * torch.diag(torch.cat((f64(20.0, 0.0, 20.0), 100 + 0 * mean[3:COEFFICIENTS])))
     covariance = torch.zeros(STATES, STATES, dtype=F64)
     covariance[:COEFFICIENTS, :COEFFICIENTS] = spread @ spread
-    nowhere, way = f64(math.nan)[0], (f64(60.0), f64(4.0))
-    belief = moved(Belief(mean.expand(1, -1), covariance.expand(1, -1, -1), unknown(nowhere.expand(1))), *way)
+    nowhere, leg = f64(math.nan)[0], (f64(60.0), f64(4.0))
+    belief = moved(Belief(mean.expand(1, -1), covariance.expand(1, -1, -1), unknown(nowhere.expand(1))), *leg)
     samples = mean + torch.nn.functional.pad(randn(4000, COEFFICIENTS, seed=1) @ spread, (0, STATES - COEFFICIENTS))
     sure = Belief(samples, torch.zeros(4000, STATES, STATES, dtype=F64), unknown(nowhere.expand(4000)))
-    after = moved(sure, way[0].expand(4000), way[1].expand(4000))
+    after = moved(sure, leg[0].expand(4000), leg[1].expand(4000))
     assert after.mean[:, 1].abs().max() < 1e-6
     fresh = after.covariance[0]  # that of the degrees that are left out
     sampled = torch.cov(after.mean.mT) + fresh
@@ -72,10 +72,10 @@ def test_the_destination_and_the_forecast_leave_its_declination_out() -> None:
     goals = [destination(belief, f64(d, 61.0, 19500.0), 300.0) for d in (0.0, 50.0)]
     first, second = (posterior(goal) for goal in goals)
     torch.testing.assert_close(first, second)
-    moves = f64((40.0, 0.0), (0.0, 40.0))
-    after = [covariance_after(goal, f64(100.0, 0.0), moves, COMPASS) for goal in goals]
+    legs = f64((40.0, 0.0), (0.0, 40.0))
+    after = [covariance_after(goal, f64(100.0, 0.0), legs, COMPASS) for goal in goals]
     torch.testing.assert_close(*after)
     worse = COMPASS._replace(noise=f64(1e3, *STD[1:]))
-    torch.testing.assert_close(covariance_after(goals[0], f64(100.0, 0.0), moves, worse), after[0])
+    torch.testing.assert_close(covariance_after(goals[0], f64(100.0, 0.0), legs, worse), after[0])
     along = after[0].diagonal(dim1=-2, dim2=-1)
     assert (along[:, 1] > 9 * along[:, 0]).all()  # known northward, and hardly eastward

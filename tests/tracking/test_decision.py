@@ -13,7 +13,7 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking.belief import STATES, Belief, elements, moved, start
 from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
 from magrl.tracking.destination import destination, posterior
-from magrl.tracking.way import DestinationPosterior
+from magrl.tracking.displacement import DestinationPosterior
 
 RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
 HERE = f64(0.0, 60.0, 20000.0)
@@ -61,7 +61,7 @@ def test_it_declares_where_it_is_sure_and_goes_on_elsewhere(north_km: float, noi
     assert decided.declare.item() is declare
     assert (decided.probability > 0.99) == declare
     if noise < 0.1:
-        assert decided.way.tolist() == pytest.approx([north_km, 0.0], abs=0.5)
+        assert decided.displacement.tolist() == pytest.approx([north_km, 0.0], abs=0.5)
 
 
 def test_fewer_steps_are_worth_less_and_without_any_it_declares() -> None:
@@ -98,7 +98,7 @@ def test_a_vehicle_near_the_border_goes_nearer_as_far_as_readings_there_help() -
     estimate's error, at most a quarter of the radius."""
     sure, unsure = decide(24.0, 1e-3, 0.0)[0], decide(24.0, 0.1, 0.2)[0]
     assert sure.stop_km.item() == pytest.approx(20.0)
-    assert unsure.stop_km.item() == pytest.approx(6.25)  # the nearest place, as each estimate is another way
+    assert unsure.stop_km.item() == pytest.approx(6.25)  # the nearest place, as each estimate differs
     for noise, least in ((1e-3, 0.32), (0.02, 1.77), (0.1, 6.25)):
         assert decide(5.0, noise, 0.0)[0].stop_km.item() == pytest.approx(least, rel=0.05)
     near = decide(20.0, 0.1, 0.0)[0]
@@ -108,7 +108,7 @@ def test_a_vehicle_near_the_border_goes_nearer_as_far_as_readings_there_help() -
     assert not barely._replace(worth=near.worth * 1.001).declare.item()
 
 
-def test_the_approach_turns_where_it_is_if_the_way_is_behind() -> None:
-    way = f64((0.0, 30.0), (-30.0, 0.0), (0.0, -80.0))
-    action = approach(way, torch.zeros(3, 1, dtype=F64), f64(4.0).expand(3, 1), 50.0, math.pi / 2)
+def test_the_approach_turns_where_it_is_if_the_destination_is_behind() -> None:
+    displacement = f64((0.0, 30.0), (-30.0, 0.0), (0.0, -80.0))
+    action = approach(displacement, torch.zeros(3, 1, dtype=F64), f64(4.0).expand(3, 1), 50.0, math.pi / 2)
     assert action.tolist() == [pytest.approx(row) for row in ([26, math.pi / 2], [0, math.pi / 2], [50, -math.pi / 2])]

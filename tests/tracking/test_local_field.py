@@ -1,4 +1,4 @@
-"""The belief of the local potential: moves, prior, readings and destination, each against what it stands for."""
+"""The belief of the local potential: legs, prior, readings and destination, each against what it stands for."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ NOISE = f64(*STD)
 
 
 def sure_belief(planet: SphericalHarmonicField, latitude: float, longitude: float) -> Belief:
-    """A belief without uncertainty, from the field along 200 moves, so that the ellipsoid is in it."""
-    way, shape = 120 * randn(200, 1, 2, seed=3), (200, COEFFICIENTS)
-    distance, heading = (x.expand(shape) for x in (way.norm(dim=-1), torch.atan2(way[..., 1], way[..., 0])))
+    """A belief without uncertainty, from the field along 200 legs, so that the ellipsoid is in it."""
+    legs, shape = 120 * randn(200, 1, 2, seed=3), (200, COEFFICIENTS)
+    distance, heading = (x.expand(shape) for x in (legs.norm(dim=-1), torch.atan2(legs[..., 1], legs[..., 0])))
     eye, zero = torch.eye(STATES, dtype=F64)[:COEFFICIENTS], torch.zeros(STATES, STATES, dtype=F64)
     each = Belief(eye.expand(*shape, -1), zero.expand(*shape, -1, -1), unknown(f64(latitude).expand(shape)))
-    rows = moved(each, distance, heading).field.mT.flatten(0, 1)  # the field after each move
+    rows = moved(each, distance, heading).field.mT.flatten(0, 1)  # the field after each leg
     here = f64(latitude).expand(200), f64(longitude).expand(200)
     there = planet(*move(*here, heading[:, 0], distance[:, 0])).flatten()
     ridge = torch.diag(f64(*[1e4 ** (1 - (n - 1) / 6) for n, _ in orders(3)])).square().inverse()
@@ -64,8 +64,8 @@ def test_generators_are_derivatives_and_turns() -> None:
 
 
 @pytest.mark.parametrize(("latitude", "course"), [(-20.0, 4.0), (75.0, 2.0)])
-def test_a_move_takes_the_field_and_its_gradient_along(latitude: float, course: float) -> None:
-    """Six moves of 50 km: 1 nT, the gradients to 0.01 nT/km; and the latitude's column by differences."""
+def test_a_leg_takes_the_field_and_its_gradient_along(latitude: float, course: float) -> None:
+    """Six legs of 50 km: 1 nT, the gradients to 0.01 nT/km; and the latitude's column by differences."""
     planet = SphericalHarmonicField(random_planets(1, seed=5)[0])
     here, belief = f64(latitude, 10.0).unbind(), sure_belief(planet, latitude, 10.0)
     assert (belief.field - planet(*here)).norm() < 0.5
@@ -87,7 +87,7 @@ def test_a_move_takes_the_field_and_its_gradient_along(latitude: float, course: 
     assert ((found.gradient - elements_gradient(value, gradient)).norm(dim=-1) < f64(3e-4, 3e-5, 0.02)).all()
 
 
-def test_a_move_adds_what_the_model_leaves_out_in_proportion_to_the_square_of_its_length() -> None:
+def test_a_leg_adds_what_the_model_leaves_out_in_proportion_to_the_square_of_its_length() -> None:
     belief = start(f64(5.0, 60.0, 20000.0), SensorStd(NOISE))
     sure = belief._replace(covariance=torch.zeros_like(belief.covariance))
     near, far = (moved(sure, f64(km)[0], f64(0.8)[0]).covariance for km in (50.0, 150.0))
@@ -176,13 +176,13 @@ def test_the_destination_is_where_the_field_is(latitude: float) -> None:
     km, heading = torch.linspace(50, 500, 12, dtype=F64), torch.linspace(0, 6, 12, dtype=F64)
     there = planet(*move(torch.full_like(km, latitude), torch.zeros_like(km), heading, km))
     belief = Belief(*(part.expand(12, *part.shape) for part in sure_belief(planet, latitude, 0.0)))
-    found = mode(destination(belief, measured_elements(there), 1e5)).displacement
+    found = mode(destination(belief, measured_elements(there), 1e5)).mean
     wanted = km.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
     assert ((found - wanted).norm(dim=-1) < 0.1 + 0.0015 * km).all()
 
 
 def test_the_posterior_is_the_integral_of_its_density() -> None:
-    """On a grid of 10 km over 1800 km, for four starts after none to two moves."""
+    """On a grid of 10 km over 1800 km, for four starts after none to two legs."""
     reading = f64((0.0, 60.0, 20000.0), (20.0, -40.0, 25000.0), (-10.0, 5.0, 35000.0), (5.0, 75.0, 12000.0))
     belief = start(reading, SensorStd(NOISE))
     axis = torch.arange(-900, 900, 10, dtype=F64)
@@ -194,9 +194,9 @@ def test_the_posterior_is_the_integral_of_its_density() -> None:
         mean = (weights * grid).sum(-2)
         wide = (weights * (grid - mean.unsqueeze(-2)).square()).sum((-2, -1)).sqrt()
         found = posterior(goal, 512)
-        way = found.way()
-        assert ((way.displacement - mean).norm(dim=-1) < 0.12 * wide).all()
-        spread = way.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().double()
+        displacement = found.displacement()
+        assert ((displacement.mean - mean).norm(dim=-1) < 0.12 * wide).all()
+        spread = displacement.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().double()
         torch.testing.assert_close(spread, wide, rtol=0.12, atol=0)
         inside = (weights.squeeze(-1) * (grid.norm(dim=-1) <= 200)).sum(-1)
         torch.testing.assert_close(found.within(200.0).double(), inside, rtol=0, atol=0.06)
@@ -210,7 +210,7 @@ def test_a_destination_beyond_the_reach_of_the_model_is_within_it() -> None:
     target, belief = elements_at(field, f64((35.7, 139.7))), start(elements_at(field, torch.stack(here, -1)), PERFECT)
     for course in f64(4.0, 4.8, 5.6):
         there = destination(belief, target, 400.0)
-        assert mode(there).displacement.norm() < 2001
+        assert mode(there).mean.norm() < 2001
         places = posterior(there)
         torch.testing.assert_close(places.weights.sum(), torch.tensor(1.0), atol=1e-4, rtol=0)
         assert places.points[places.weights > 0].norm(dim=-1).max() < 2001
@@ -221,9 +221,10 @@ def test_a_destination_beyond_the_reach_of_the_model_is_within_it() -> None:
 
 @pytest.mark.parametrize(("bias", "least"), [(0.0, 0.8), (math.inf, 0.6)], ids=["true north", "magnetic north"])
 def test_it_is_as_sure_as_it_is_right_on_random_planets(bias: float, least: float) -> None:
-    """Flights of eight random moves on 256 planets: NEES of the way and of the innovations, 1 where they are right.
+    """Flights of eight random legs on 256 planets: NEES of the displacement and of the innovations, 1 where they are
+    right.
 
-    Without true north, headings and the way are from magnetic north, and a reading has two elements.
+    Without true north, headings and the displacement are from magnetic north, and a reading has two elements.
     """
     count, magnetic = 128, math.isinf(bias)
     errors = SensorStd(NOISE, *(f64(*kind).expand(count, 3) for kind in ((bias, 0.0, 0.0), *[(0.0,) * 3] * 2)))
@@ -247,10 +248,10 @@ def test_it_is_as_sure_as_it_is_right_on_random_planets(bias: float, least: floa
             belief = read(belief, reading, NOISE.expand(count, 3))
         assert torch.equal(belief.magnetic, torch.full((count,), magnetic))
         distance, bearing = geodesic(*here, *place)
-        way = posterior(destination(belief, target, 220.0)).way()
+        displacement = posterior(destination(belief, target, 220.0)).displacement()
         bearing = bearing - north
-        error = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) - way.displacement
-        ratios.append((error * torch.linalg.solve(way.covariance.double(), error)).sum(-1).mean() / 2)
+        error = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) - displacement.mean
+        ratios.append((error * torch.linalg.solve(displacement.covariance.double(), error)).sum(-1).mean() / 2)
         course, km = heading + 1.2 * math.sin(2 * step), torch.full_like(heading, 45.0)
         here, belief = move(*here, course + north, km), moved(belief, km, course)
     assert 0.7 < torch.stack(squares).mean() < 1.3

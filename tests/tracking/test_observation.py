@@ -40,7 +40,7 @@ def started() -> tuple[Rules, Track, Reading]:
 
 
 def test_the_numbers_by_hand() -> None:
-    """A way of 50 km; standard deviations of 20 and 40 km; the ellipse [[.02, .01], [.01, .02]]; F of 2.09."""
+    """A distance of 50 km; standard deviations of 20 and 40 km; the ellipse [[.02, .01], [.01, .02]]; F of 2.09."""
     expected = [
         *(0.6, 0.8),  # direction
         *(math.log(3.5) - 2, 50 / 400 - 0.5),  # length
@@ -58,7 +58,7 @@ def test_the_numbers_by_hand() -> None:
 
 
 def test_numbers_at_the_extremes() -> None:
-    """No way, no uncertainty, no gradient; and a way beyond all measure, whose direction is still seen."""
+    """No distance, no uncertainty, no gradient; and a distance beyond all measure, whose direction is still seen."""
     flat = by_hand(aim=torch.zeros(2), covariance=torch.zeros(2, 2), gradient=torch.zeros(3, 2))
     assert flat.isfinite().all()
     assert flat[:2].tolist() == [0.0, 0.0]
@@ -84,7 +84,7 @@ def test_a_turn_of_world_and_vehicle_is_not_observed() -> None:
     for elements in (field, target, track.local.value):
         elements[:, 0] = torch.remainder(elements[:, 0] + math.degrees(3.0) + 180, 360) - 180
     aim, plan, gradient = (vectors @ turn.mT for vectors in (track.aim, track.plan, track.local.gradient))
-    way = track.way._replace(covariance=turn @ track.way.covariance.double() @ turn.mT)
-    track = track._replace(aim=aim, plan=plan, way=way, local=track.local._replace(gradient=gradient))
+    displacement = track.displacement._replace(covariance=turn @ track.displacement.covariance.double() @ turn.mT)
+    track = track._replace(aim=aim, plan=plan, displacement=displacement, local=track.local._replace(gradient=gradient))
     found = observation(rules, track, other._replace(field=field, target=target))
     torch.testing.assert_close(found, plain, rtol=1e-5, atol=1e-5)

@@ -15,10 +15,10 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking import Reading, Rules, act, advance, begin, declaring, earth_model, pilot
 from magrl.tracking.belief import Belief, start
 from magrl.tracking.decision import ArrivalDecision
+from magrl.tracking.displacement import Displacement
 from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.records import State
 from magrl.tracking.search import VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
-from magrl.tracking.way import Way
 from magrl.transforms.track import reading_of
 
 ERRORS = SensorStd(STD, (0.5, 0.3, 60.0), (0.3, 0.2, 30.0), (20.0, 20.0, 20.0))
@@ -33,7 +33,7 @@ def reading(seen: TensorDict, number: int) -> Reading:
 
 @pytest.fixture
 def readings() -> tuple[Reading, Reading]:
-    """Those of four vehicles at the start and after a move."""
+    """Those of four vehicles at the start and after a leg."""
     first = first_reading()
     return reading(first, 0), reading(moved(first, 40.0, 0.3, f64(0.3, 0.5, 60.0)), 1)
 
@@ -105,12 +105,12 @@ def test_a_place_without_an_arrival_is_left(rule: str, known: dict[str, object])
     still = moved(seen, 0.1, 0.0, f64(0.0, 0.0, 0.0))
     first, second = (reading(*one)._replace(place=place, target_place=place) for one in ((seen, 0), (still, 1)))
     track = advance(rules, begin(rules, first).state, second)
-    apart = (track.aim - track.way.displacement).norm(dim=-1)
+    apart = (track.aim - track.displacement.mean).norm(dim=-1)
     assert (apart > 5).all() if rules.signaled and not known else (apart == 0).all()
 
 
 def test_each_vehicle_may_have_its_own_price_of_a_step(readings) -> None:
-    """With a higher price moves are longer; without caution they are nearer to the way."""
+    """With a higher price legs are longer; without caution they are nearer to the displacement."""
     own = begin(RULES, readings[0]._replace(price=f64(0.1, 0.1, 30.0, 30.0)))
     cheap, dear, careless = (
         begin(RULES.replace(step_price=price, caution=caution), readings[0]).plan
@@ -118,7 +118,7 @@ def test_each_vehicle_may_have_its_own_price_of_a_step(readings) -> None:
     )
     torch.testing.assert_close(own.plan, torch.cat((cheap[:2], dear[2:])))
     assert (cheap.norm(dim=-1) < dear.norm(dim=-1) - 10).any()
-    ahead, aside = (torch.cosine_similarity(plan, own.way.displacement) for plan in (careless, cheap))
+    ahead, aside = (torch.cosine_similarity(plan, own.displacement.mean) for plan in (careless, cheap))
     assert ahead.mean() > aside.mean() + 0.05
 
 
@@ -140,7 +140,7 @@ def test_it_goes_to_the_estimated_place_where_that_is_near(readings, monkeypatch
     assert sent[:, 2].tolist() == [-1.0] * 4
 
 
-WRONG = {"max_move_km": 0.0, "max_turn_rad": 4.0, "max_steps": 0, "zeta": math.nan, "arrival": "guessed"}
+WRONG = {"max_leg_km": 0.0, "max_turn_rad": 4.0, "max_steps": 0, "zeta": math.nan, "arrival": "guessed"}
 WRONG |= {"radius_km": -1.0, "confidence": 2.0, "range_km": math.inf, "target_std": (0.0, -1.0, 0.0), "step_price": 0.0}
 WRONG |= {"caution": -0.1, "search": True}
 
@@ -155,15 +155,15 @@ LONG = torch.tensor([[36.0, 200.0], [200.0, 2500.0]])  # [km^2]: 6 km northward,
 ELLIPSE = torch.diag(torch.tensor([1 / 20.0**2, 1 / 12.0**2]))
 
 
-def searched(destinations: torch.Tensor, moves: int) -> torch.Tensor:
+def searched(destinations: torch.Tensor, legs: int) -> torch.Tensor:
     """Which of some destinations are found, by vehicles that start at the mean of what is known and go where told."""
     count = len(destinations)
     here, visited = torch.zeros(count, 2), visit(unvisited_yet(torch.zeros(count, 3)), torch.zeros(count, 2))
     found = torch.zeros(count, dtype=torch.bool)
-    for _ in range(moves):
+    for _ in range(legs):
         left = destinations - here
         found |= (left.unsqueeze(-2) @ ELLIPSE @ left.unsqueeze(-1)).flatten() <= 1
-        step = unvisited(Way(-here, LONG.expand(count, 2, 2)), visited, ELLIPSE.expand(count, 2, 2))
+        step = unvisited(Displacement(-here, LONG.expand(count, 2, 2)), visited, ELLIPSE.expand(count, 2, 2))
         here, visited = here + step, visit(visited, step)
     return found
 
@@ -176,24 +176,24 @@ def test_a_search_finds_nearly_all_that_the_estimate_allows() -> None:
     assert found[1] > 0.9  # the samples reach to two standard deviations
 
 
-def test_the_mean_is_the_way_until_the_vehicle_has_been_there() -> None:
+def test_the_mean_is_the_displacement_until_the_vehicle_has_been_there() -> None:
     mean = torch.tensor([100.0, -80.0])
     for nearest, expected in ((19.9, False), (20.1, True)):
         visited = unvisited_yet(torch.zeros(3))
         visited[5] = mean + torch.tensor([nearest, 0.0])
-        assert torch.equal(unvisited(Way(mean, LONG), visited, ELLIPSE), mean) == expected
+        assert torch.equal(unvisited(Displacement(mean, LONG), visited, ELLIPSE), mean) == expected
 
 
 @pytest.mark.parametrize("north", [1000.0, -1000.0])
 def test_of_places_as_probable_the_nearer_is_searched(north: float) -> None:
-    """The mean has been visited, and the estimate is wide along the way to it."""
+    """The mean has been visited, and the estimate is wide along the displacement to it."""
     mean, visited = torch.tensor([north, 0.0]), unvisited_yet(torch.zeros(3))
     visited[0] = mean
-    found = unvisited(Way(mean, torch.diag(torch.tensor([400.0**2, 1.0]))), visited, ELLIPSE)
+    found = unvisited(Displacement(mean, torch.diag(torch.tensor([400.0**2, 1.0]))), visited, ELLIPSE)
     assert found.norm() < 1000 - 20
 
 
-def test_short_moves_do_not_fill_the_memory() -> None:
+def test_short_legs_do_not_fill_the_memory() -> None:
     visited = visit(unvisited_yet(torch.zeros(3)), torch.tensor([30.0, 0.0]))
     for _ in range(2 * VISITED):
         visited = visit(visited, torch.tensor([0.0, 0.5]))

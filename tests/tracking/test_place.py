@@ -55,7 +55,7 @@ def test_a_belief_follows_its_model() -> None:
 
 @pytest.mark.parametrize("latitude", [65.0, -65.0])
 def test_an_error_of_the_place_is_carried_as_geodesics_are(latitude: float) -> None:
-    """A move from 1 km to the north or to the east of the place, on the same course, ends where its error does."""
+    """A leg from 1 km to the north or to the east of the place, on the same course, ends where its error does."""
     motion, none = Motion(earth_model("IGRF-14", "2025-01-01")), torch.zeros(4).double()
     course, km = torch.tensor([0.0, 1.0, 2.5, 4.0]).double(), none + 100
     place = torch.tensor([latitude, 20.0]).double().expand(4, 2)
@@ -69,7 +69,7 @@ def test_an_error_of_the_place_is_carried_as_geodesics_are(latitude: float) -> N
 
 
 def test_a_model_without_an_error_leaves_none_of_the_field() -> None:
-    """After any move, where place and drift have none."""
+    """After any leg, where place and drift have none."""
     motion = Motion(EarthModel("exact", IGRF("2025-01-01"), torch.zeros(14).double()))
     after = moved(at_place(PLACES, 0.0, std_of(), motion), *torch.full((2, 4), 50.0), std_of(), motion)
     assert not after.covariance.any()
@@ -154,8 +154,8 @@ def test_models_and_rules_that_do_not_fit(call, message: str) -> None:
 
 
 def scenario_of(latitude: float) -> Scenario:
-    scenario = earth_scenario(4, 3, max_move_km=90.0, max_latitude=latitude, distance_range_km=(300.0, 500.0))
-    scenario = scenario.replace(max_move_km=50.0, max_steps=15, arrival="declared", start_heading="random")
+    scenario = earth_scenario(4, 3, max_leg_km=90.0, max_latitude=latitude, distance_range_km=(300.0, 500.0))
+    scenario = scenario.replace(max_leg_km=50.0, max_steps=15, arrival="declared", start_heading="random")
     return scenario.with_tasks(scenario.random_tasks(6, 3))
 
 

@@ -1,4 +1,4 @@
-"""The plan of the next move: what a reading will teach, against the belief after it, and what the plan weighs."""
+"""The plan of the next leg: what a reading will teach, against the belief after it, and what the plan weighs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking import planning
 from magrl.tracking.belief import ANOMALY, CONSTANT, Belief, elements, moved, read, start
 from magrl.tracking.destination import Destination, destination, mode, posterior
+from magrl.tracking.displacement import DestinationPosterior
 from magrl.tracking.forecast import covariance_after
-from magrl.tracking.planning import planned_move, step_price
+from magrl.tracking.planning import planned_leg, step_price
 from magrl.tracking.prior import DEGREE, closure
-from magrl.tracking.way import DestinationPosterior
 
 RANGE_KM, KM = 300.0, f64(40.0)[0]
 HERE = f64(8.0, -16.0, 35000.0)
@@ -48,15 +48,15 @@ def flown(reading: Tensor, errors: SensorStd, legs: int) -> Destination:
     return goal_of(track(reading, errors, legs), errors)
 
 
-def polar(way: Tensor) -> tuple[Tensor, Tensor]:
-    return way.norm(), torch.atan2(way[1], way[0])
+def polar(displacement: Tensor) -> tuple[Tensor, Tensor]:
+    return displacement.norm(), torch.atan2(displacement[1], displacement[0])
 
 
-def prediction(belief: Belief, way: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The field at the end of a way: covariance, slopes ``(6,)`` by differences over 2 km, and theirs ``(6, 6)``."""
+def prediction(belief: Belief, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The field at its end: covariance, slopes ``(6,)`` by differences over 2 km, and theirs ``(6, 6)``."""
 
     def field(mean: Tensor, north: float, east: float) -> Tensor:
-        return moved(belief._replace(mean=mean), *polar(way + f64(north, east))).field
+        return moved(belief._replace(mean=mean), *polar(displacement + f64(north, east))).field
 
     def slopes(mean: Tensor) -> Tensor:
         ends = [field(mean, *end) - field(mean, *(-x for x in end)) for end in ((1.0, 0.0), (0.0, 1.0))]
@@ -67,9 +67,9 @@ def prediction(belief: Belief, way: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 def flown_covariance(
-    belief: Belief, goal: Destination, way: Tensor, leg: Tensor, errors: SensorStd, readings: int = 1
+    belief: Belief, goal: Destination, displacement: Tensor, leg: Tensor, errors: SensorStd, readings: int = 1
 ) -> Tensor:
-    """The covariance of a way by the belief after a leg and the expected readings at its end."""
+    """The covariance of a displacement by the belief after a leg and the expected readings at its end."""
     origin = belief.latitude, torch.zeros((), dtype=F64)
     km, course = polar(leg)
     after = moved(belief, km, course, errors, crust_nt=goal.crust)
@@ -77,10 +77,10 @@ def flown_covariance(
         anomaly = elements_jacobian(after.field) @ after.mean[ANOMALY]
         after = read(after, elements(after).value + after.mean[CONSTANT] + anomaly, errors.noise, course)
     after = destination(after, f64(0.0, 60.0, 20000.0), RANGE_KM, goal.crust, errors).belief
-    distance, bearing = geodesic(*move(*origin, course, km), *move(*origin, *polar(way)[::-1]))
+    distance, bearing = geodesic(*move(*origin, course, km), *move(*origin, *polar(displacement)[::-1]))
     covariance, _, later = prediction(after, distance * torch.stack((bearing.cos(), bearing.sin())))
-    _, slopes, now = prediction(goal.belief, way)
-    square = (way - leg).square().sum() / 1000**2
+    _, slopes, now = prediction(goal.belief, displacement)
+    square = (displacement - leg).square().sum() / 1000**2
     left_out = closure().left_out_nt ** 2 * square**DEGREE + goal.noise_at(square)
     precision = torch.linalg.inv(covariance + left_out * torch.eye(3, dtype=F64))
     squares = (slopes[:, None] * slopes + now - later).unflatten(0, (2, 3)).unflatten(-1, (2, 3)).transpose(1, 2)
@@ -98,47 +98,47 @@ def test_the_forecast_is_the_covariance_after_the_leg_is_flown(
     errors: SensorStd, crust_nt: float, reading: Tensor, legs: int, missing: int | None
 ) -> None:
     """By ``moved``, ``read`` and differences of what is predicted."""
-    belief, moves = track(reading, errors, legs, crust_nt), f64((30.0, 0.0), (-10.0, 40.0))
+    belief, tried = track(reading, errors, legs, crust_nt), f64((30.0, 0.0), (-10.0, 40.0))
     goal = goal_of(belief, errors, crust_nt)
-    way = mode(goal).displacement
+    displacement = mode(goal).mean
     if missing is not None:
         errors = errors._replace(noise=NOISE.index_fill(0, torch.tensor([missing]), math.inf))
-    for found, leg in zip(covariance_after(goal, way, moves, errors), moves, strict=True):
-        assert differs(found, flown_covariance(belief, goal, way, leg, errors)) < 0.015
+    for found, leg in zip(covariance_after(goal, displacement, tried, errors), tried, strict=True):
+        assert differs(found, flown_covariance(belief, goal, displacement, leg, errors)) < 0.015
 
 
 def test_the_forecast_averages_the_noise_of_many_readings() -> None:
     errors, leg = SensorStd(4 * NOISE), f64(20.0, -30.0)
     belief = track(HERE, errors, 2)
     goal = goal_of(belief, errors)
-    way = mode(goal).displacement
-    one, six = covariance_after(goal, way, leg.expand(2, 2), errors, torch.tensor([1, 6]))
-    assert differs(six, flown_covariance(belief, goal, way, leg, errors, readings=6)) < 0.02
+    displacement = mode(goal).mean
+    one, six = covariance_after(goal, displacement, leg.expand(2, 2), errors, torch.tensor([1, 6]))
+    assert differs(six, flown_covariance(belief, goal, displacement, leg, errors, readings=6)) < 0.02
     assert six.trace() < 0.8 * one.trace()
 
 
 @pytest.mark.parametrize("errors", [WHITE, SHIP], ids=["white", "ship"])
 def test_a_more_accurate_reading_never_increases_the_forecast(errors: SensorStd) -> None:
     """In any direction; a missing reading is the least accurate."""
-    goal, moves = flown(HERE, errors, 1), 60 * randn(20, 2)
-    way, stds = mode(goal).displacement, (math.inf, 30.0, 3.0, 1.0, 0.3, 0.0)
+    goal, legs = flown(HERE, errors, 1), 60 * randn(20, 2)
+    displacement, stds = mode(goal).mean, (math.inf, 30.0, 3.0, 1.0, 0.3, 0.0)
     noises = [NOISE * std if std else 0 * NOISE for std in stds]
-    after = torch.stack([covariance_after(goal, way, moves, errors._replace(noise=noise)) for noise in noises])
+    after = torch.stack([covariance_after(goal, displacement, legs, errors._replace(noise=noise)) for noise in noises])
     assert torch.linalg.eigvalsh(after[:-1] - after[1:]).amin() > -1e-4 * after.norm()
     assert (after.diagonal(dim1=-2, dim2=-1).sum(-1)[1:].diff(dim=0) < 0).all()
 
 
 def plan(goal: Destination, price_km: float, errors: SensorStd, **options: float) -> tuple[float, float]:
-    """Length [km] of the move, and its angle to the way [deg]."""
+    """Length [km] of the leg, and its angle to the displacement [deg]."""
     points = posterior(goal)
-    aim = points.way().displacement.double()
-    planned = planned_move(goal, points, aim, errors, f64(price_km)[0], 50.0, **options)
+    aim = points.displacement().mean.double()
+    planned = planned_leg(goal, points, aim, errors, f64(price_km)[0], 50.0, **options)
     (length, course), (_, ahead) = polar(planned), polar(aim)
     return length.item(), abs(math.degrees(course - ahead))
 
 
 def test_the_plan_weighs_steps_path_and_what_is_learned() -> None:
-    """Cheap steps are short ones; where the way across is unknown, a move aside teaches it, and more so with noise."""
+    """Cheap steps are short ones; where the distance across is unknown, a leg aside teaches it, more so with noise."""
     goal, noisy = flown(HERE, WHITE, 0), SensorStd(4 * NOISE)
     cheap, dear = plan(goal, 0.1, WHITE), plan(goal, 100.0, WHITE)
     assert plan(goal, 0.1, WHITE, caution=0.0) == pytest.approx((5.0, 0.0), abs=1e-4)
@@ -148,7 +148,7 @@ def test_the_plan_weighs_steps_path_and_what_is_learned() -> None:
     assert plan(goal, 0.1, WHITE, caution=3.0)[0] > cheap[0]
 
 
-def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
+def test_a_sure_displacement_is_gone_and_a_batch_is_its_parts() -> None:
     goal = flown(HERE, WHITE, 2)
     sure = goal._replace(belief=goal.belief._replace(covariance=1e-9 * goal.belief.covariance))
     aims, prices, apart = f64((-90.0, 120.0), (0.0, 30.0)), f64(3.0, 1.0), f64((0.0, 5.0), (0.0, -5.0))
@@ -159,24 +159,24 @@ def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
         here = Destination(belief, field, goal.range, noise, crust, share)
         points = aims[index].unsqueeze(-2) + apart + 100.0  # of which only the shape counts
         posterior = DestinationPosterior(points, torch.full(points.shape[:-1], 0.5, dtype=F64))
-        return planned_move(here, posterior, aims[index], WHITE, prices[index], 50.0)
+        return planned_leg(here, posterior, aims[index], WHITE, prices[index], 50.0)
 
     torch.testing.assert_close(planned(0), f64(-30.0, 40.0))
     torch.testing.assert_close(planned(slice(None)), torch.stack((planned(0), planned(1))))
 
 
 def test_the_detour_by_hand() -> None:
-    """400 km and 300 km across; at the place itself; and 80 km along a way of 60 km, of which a fifth counts."""
-    way, across = f64((400.0, 0.0), (0.0, 0.0), (60.0, 0.0)), torch.zeros(3, 2, 2, dtype=F64)
+    """400 km and 300 km across; at the place itself; and 80 km along 60 km, of which a fifth counts."""
+    displacement, across = f64((400.0, 0.0), (0.0, 0.0), (60.0, 0.0)), torch.zeros(3, 2, 2, dtype=F64)
     across[:2, 1, 1], across[2, 0, 0] = 300.0**2, 5 * 80.0**2
-    torch.testing.assert_close(planning._detour(way, across), f64(100.0, 300.0, 40.0))
+    torch.testing.assert_close(planning._detour(displacement, across), f64(100.0, 300.0, 40.0))
 
 
 def test_the_price_of_a_step_rises_as_steps_run_out() -> None:
-    """Of 50 steps, 15 are for a way of 500 km; a poor reading keeps some in reserve, and a missing one none."""
+    """Of 50 steps, 15 are for a distance of 500 km; a poor reading keeps some in reserve, and a missing one none."""
 
-    def price(percent: object, range_km: float, way_km: float, steps: Tensor, std: object) -> list[float]:
-        return step_price(percent, range_km, f64(0.0, way_km), steps, std, 50, 50.0).tolist()
+    def price(percent: object, range_km: float, distance_km: float, steps: Tensor, std: object) -> list[float]:
+        return step_price(percent, range_km, f64(0.0, distance_km), steps, std, 50, 50.0).tolist()
 
     exact, steps = (0.0, 0.0, 0.0), torch.tensor([0, 10, 34, 49])
     assert price(0.5, 400.0, 500.0, steps, exact) == pytest.approx([2 * (50 / x) ** 4 for x in (35, 25, 1, 1)])

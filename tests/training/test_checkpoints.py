@@ -104,7 +104,7 @@ def test_other_formats_and_other_parts_are_refused_by_name(saved) -> None:
     for parts, content, message in (
         ({"buffer": part}, None, r"holds \['part'\], not \['buffer'\]"),
         ({"part": nn.Linear(1, 1)}, None, "part does not fit this training"),
-        ({"part": part}, {"format": 99, "frames": 1, "parts": {}}, "of format 99; this version reads 1"),
+        ({"part": part}, {"format": 99, "frames": 1, "parts": {}}, "of format 99; this version reads 2"),
     ):
         if content:
             save_tensors(content, checkpoints.files()[-1])

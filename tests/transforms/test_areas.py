@@ -12,7 +12,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import no_go_env
 from magrl.evaluation.navigators import make_navigator
 from magrl.geodesy import geodesic, move_place
-from magrl.transforms import NoGoAreas, TrueWay
+from magrl.transforms import NoGoAreas, TrueDisplacement
 from magrl.transforms.areas import NUMBER, distance_km, outlines, turned
 
 
@@ -26,7 +26,7 @@ def flown(**options: object) -> TensorDict:
 def test_a_leg_that_meets_an_area_ends_the_episode_without_success() -> None:
     """Straight to the destination, an episode succeeds where the straight line is free, but for the last part of it."""
     steps = flown()
-    start = TransformedEnv(GeomagneticNavEnv(num_envs=64, seed=3), Compose(TrueWay(), NoGoAreas())).reset()
+    start = TransformedEnv(GeomagneticNavEnv(num_envs=64, seed=3), Compose(TrueDisplacement(), NoGoAreas())).reset()
     centers, radii = NoGoAreas.discs(start["no_go_areas"])
     free = (distance_km(centers, start["no_go_areas"][:, -2:], torch.zeros(64, 2)) > radii).all(-1)
     ended = steps["done"].squeeze(-1)
@@ -85,7 +85,7 @@ def test_pictures_show_the_areas() -> None:
 
 def test_areas_join_the_observation_alone() -> None:
     """Not what other transforms concatenate."""
-    joined = [CatTensors(["move", "heading"], "own", del_keys=False)]
+    joined = [CatTensors(["leg", "heading"], "own", del_keys=False)]
     state = no_go_env(2, seed=0, transforms=joined).reset()
     assert state["observation"].shape == (2, 22)
     assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()

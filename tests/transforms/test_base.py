@@ -42,7 +42,7 @@ from magrl.transforms import (
     TargetDifference,
     TargetErrors,
     TrackField,
-    TrueWay,
+    TrueDisplacement,
     sensor_levels,
 )
 from magrl.transforms.base import key_list
@@ -60,14 +60,15 @@ def guided() -> Transform:
         SensorErrors(levels=sensor_levels),
         TargetDifference(),
         AngleVector(["heading"], ["course"]),
-        MinMaxNorm(["move"], ["m"], ["action"]),
+        MinMaxNorm(["leg"], ["m"], ["action"]),
     )
 
 
 def rewarded() -> Transform:
     """Rewards of agents without a map, with what a policy with a memory sees."""
-    rewards = (RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward(), NoGoAreas(), ProgressReward())
-    return Compose(*rewards, KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity"]))
+    rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(), NoGoAreas()
+    others = ProgressReward(), KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity"])
+    return Compose(*rewards, *others)
 
 
 def declared() -> Transform:

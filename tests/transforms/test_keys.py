@@ -23,11 +23,11 @@ from magrl.transforms.base import StatefulTransform
 from magrl.transforms.track import READ_KEYS
 
 FLAGS = ("done", "terminated", "truncated")
-SIZES = {"field": 3, "target_field": 3, "move": 2, "heading": 1, "elapsed_steps": 1, "position": 2}
-SIZES |= {"target_position": 2, "start_position": 2, "true_way": 2, "highest_spl": 1, "step_price": 1}
+SIZES = {"field": 3, "target_field": 3, "leg": 2, "heading": 1, "elapsed_steps": 1, "position": 2}
+SIZES |= {"target_position": 2, "start_position": 2, "true_displacement": 2, "highest_spl": 1, "step_price": 1}
 SIZES |= {"fix": 2, "target_fix": 2}
 SIZES |= {"gradient_heading": 1, "number": 1, "field_gradient": 6} | dict.fromkeys(("success", *FLAGS), 1)
-LEAST = {"field": (5.0, -16.0, 35000.0), "target_field": (6.0, -20.0, 35500.0), "true_way": (300.0, 100.0)}
+LEAST = {"field": (5.0, -16.0, 35000.0), "target_field": (6.0, -20.0, 35500.0), "true_displacement": (300.0, 100.0)}
 LEAST |= {"position": (3.0, 160.0), "target_position": (6.0, 163.0), "start_position": (2.0, 159.0)}
 LEAST |= {"fix": (3.0, 160.0), "target_fix": (6.0, 163.0)}
 
@@ -38,9 +38,7 @@ class Foreign(EnvBase):
     def __init__(self, batch: tuple[int, ...], names: list[str], key: Callable[[str], NestedKey], actions: int) -> None:
         super().__init__(batch_size=torch.Size(batch))
         self.names, self.key, self.count = names, key, 0
-        self.observation_spec = Composite(
-            displacement=Bounded(-99.0, 99.0, (*batch, 2), dtype=torch.float64), shape=batch
-        )
+        self.observation_spec = Composite(leg_error=Bounded(-99.0, 99.0, (*batch, 2), dtype=torch.float64), shape=batch)
         for name, value in self._values().items():
             if key(name) not in FLAGS:
                 self.observation_spec[key(name)] = Unbounded(value.shape, dtype=value.dtype)
@@ -67,7 +65,7 @@ class Foreign(EnvBase):
 
     def _state(self) -> TensorDict:
         td = TensorDict({flag: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for flag in FLAGS}, self.batch_size)
-        td["displacement"] = torch.zeros(*self.batch_size, 2, dtype=torch.float64)
+        td["leg_error"] = torch.zeros(*self.batch_size, 2, dtype=torch.float64)
         for name, value in self._values().items():
             td[self.key(name)] = value
         return td
@@ -101,7 +99,7 @@ OPTIONS: dict[type[Transform], dict] = {
     transforms.TargetErrors: {"target_std": STD},
     transforms.Spikes: {"sizes": STD, "rate": 0.5},
 }
-IN_KEYS = {AngleVector: ["heading"], EpisodeSum: ["number"], MinMaxNorm: ["move"]}
+IN_KEYS = {AngleVector: ["heading"], EpisodeSum: ["number"], MinMaxNorm: ["leg"]}
 IN_KEYS |= {
     transforms.AlignmentReward: ["heading", "gradient_heading"],
     TrackField: READ_KEYS,

@@ -20,7 +20,7 @@ from magrl.transforms import Fix, MotionError, RecentLegs
 
 BASE = paper_env(1)
 MAP = Fix(BASE.field, BASE.region.expanded(5.0))
-PUBLIC = ["field", "target_field", "move", "heading", "elapsed_steps"]
+PUBLIC = ["field", "target_field", "leg", "heading", "elapsed_steps"]
 
 
 def off_km(places: Tensor, fixes: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def test_a_map_in_which_two_places_look_alike_is_refused() -> None:
 def test_the_set_of_a_current_is_seen_from_the_heading(heading: float) -> None:
     """A current of half the speed, northward: its direction is the third number of the errors."""
     motion = MotionError(current_km_h=0.5, speed_km_h=1.0)
-    base = GeomagneticNavEnv(num_envs=3, seed=0, max_move_km=20.0, drift_km=12.0)
+    base = GeomagneticNavEnv(num_envs=3, seed=0, max_leg_km=20.0, drift_km=12.0)
     env = TransformedEnv(base, Compose(motion, Fix(base.field, base.region), RecentLegs(2)))
     state = env.reset()
     state["motion_error"][:, 2] = 0.0

@@ -1,4 +1,4 @@
-"""Rewards and what they need: the true way, short paths, the gradient of the field, and alignment with it."""
+"""Rewards and what they need: the true displacement, short paths, the gradient of the field, and alignment with it."""
 
 import math
 from collections.abc import Callable
@@ -25,28 +25,29 @@ from magrl.transforms import (
     ProgressReward,
     RandomStepPrice,
     SPLReward,
-    TrueWay,
+    TrueDisplacement,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 
 
-# The way
+# The displacement
 
 
 @pytest.mark.parametrize("latitude", [-70.0, 0.0, 45.0])
-def test_way_leads_to_the_target(latitude: float) -> None:
+def test_displacement_leads_to_the_target(latitude: float) -> None:
     """A vehicle that turns towards it and goes its length arrives, from any heading and across the antimeridian."""
     heading = torch.linspace(-math.pi, math.pi, 9, dtype=torch.float64).unsqueeze(-1)
     here = torch.tensor([[latitude, 179.5]], dtype=torch.float64).expand(9, 2)
     there = torch.tensor([[latitude + 2.0, -178.0]], dtype=torch.float64).expand(9, 2)
-    way = TrueWay()(TensorDict(position=here, target_position=there, heading=heading))["true_way"]
-    bearing = heading.squeeze(-1) + torch.atan2(way[:, 1], way[:, 0])
-    arrived = torch.stack(move(*here.unbind(-1), bearing, way.norm(dim=-1)), -1)
+    td = TensorDict(position=here, target_position=there, heading=heading)
+    displacement = TrueDisplacement()(td)["true_displacement"]
+    bearing = heading.squeeze(-1) + torch.atan2(displacement[:, 1], displacement[:, 0])
+    arrived = torch.stack(move(*here.unbind(-1), bearing, displacement.norm(dim=-1)), -1)
     gap_km, _ = geodesic(*arrived.unbind(-1), *there.unbind(-1))
     assert gap_km.max() < 0.01
-    assert way[4, 0] > 0  # heading north, to a target ahead
-    assert way[4, 1] > 0  # and to the right
+    assert displacement[4, 0] > 0  # heading north, to a target ahead
+    assert displacement[4, 1] > 0  # and to the right
 
 
 # The reward
@@ -57,8 +58,8 @@ def test_highest_spl_by_hand() -> None:
     start, target = torch.zeros(3, 2), torch.tensor([[0.0, 0.898315]]).expand(3, 2)
     flags = torch.tensor([[False], [True], [False]]), torch.tensor([[False], [True], [True]])
     after = TensorDict(
-        true_way=torch.tensor([[60.0, 0.0], [3.0, 4.0], [60.0, 0.0]]),
-        move=torch.tensor([[60.0, 0.1], [100.0, 0.0], [60.0, 0.0]]),
+        true_displacement=torch.tensor([[60.0, 0.0], [3.0, 4.0], [60.0, 0.0]]),
+        leg=torch.tensor([[60.0, 0.1], [100.0, 0.0], [60.0, 0.0]]),
         start_position=start,
         target_position=target,
         success=flags[0],
@@ -66,7 +67,7 @@ def test_highest_spl_by_hand() -> None:
         step_price=torch.full((3, 1), 0.5),
         batch_size=[3],
     )
-    before = {"true_way": torch.tensor([[0.0, 100.0]]).expand(3, 2), "highest_spl": torch.ones(3, 1)}
+    before = {"true_displacement": torch.tensor([[0.0, 100.0]]).expand(3, 2), "highest_spl": torch.ones(3, 1)}
     step = SPLReward()(HighestSPL()(TensorDict({**before, "next": after}, [3])))["next"]
     torch.testing.assert_close(step["highest_spl"], torch.tensor([[100 / 120], [1.0], [0.0]]), rtol=0, atol=1e-4)
     torch.testing.assert_close(step["reward"], 10 * (step["highest_spl"] - 1) - 0.05)
@@ -74,8 +75,8 @@ def test_highest_spl_by_hand() -> None:
 
 def test_returns_depend_on_both_ends_alone() -> None:
     """Progress: kilometers nearer over 50, 10 at the arrival, 0.1 for each step; else SPL less the price of steps."""
-    rollouts = []
-    for rewards in ((TrueWay(), ProgressReward()), (RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())):
+    rollouts, efficiency = [], (RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward())
+    for rewards in ((TrueDisplacement(), ProgressReward()), efficiency):
         env = TransformedEnv(nav(64, max_steps=10), Compose(*rewards))
         rollouts.append(evaluation_rollout(env, Secant()))
     measures = episode_measures(rollouts[0])
@@ -102,8 +103,9 @@ def test_prices_are_log_uniform_and_stay_for_an_episode() -> None:
 
 
 def test_what_is_missing_is_named() -> None:
-    """Without the state before the move there is no reward, and that of the environment must not pass for it."""
-    td = TransformedEnv(nav(), Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())).rollout(1)
+    """Without the state before the leg there is no reward, and that of the environment must not pass for it."""
+    rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward()
+    td = TransformedEnv(nav(), Compose(*rewards)).rollout(1)
     with pytest.raises(KeyError, match=r"SPLReward reads its state .*highest_spl"):
         SPLReward()(td.exclude("highest_spl"))
     with pytest.raises(KeyError, match=r"HighestSPL reads .*success"):
@@ -114,10 +116,10 @@ def test_distance_cost_is_paid_for_each_kilometer() -> None:
     env = TransformedEnv(nav(4), DistanceCost(0.05))
     action = torch.tensor([30.0, 0.1]).expand(4, 2)
     costly = env.rollout(2, lambda td: td.set("action", action))
-    reward, move = costly["next", "reward"], costly["next", "move"]
+    reward, leg = costly["next", "reward"], costly["next", "leg"]
     terms = costly["next", "reward_destination"] + costly["next", "reward_proximity"]
-    torch.testing.assert_close(reward, terms - 0.05 * move[..., :1])
-    assert (move[..., 0] == 30).all()
+    torch.testing.assert_close(reward, terms - 0.05 * leg[..., :1])
+    assert (leg[..., 0] == 30).all()
 
 
 def test_field_gradient_is_the_slope_between_neighbors() -> None:
@@ -235,7 +237,7 @@ MISTAKES: dict[str, Callable[[], object]] = {
     "'Z'.*D, I, B_H": lambda: GradientHeading(pair=("D", "Z")),
     r"got \(2, 3\)": lambda: guided(FieldGradient(field(), ["field"])).specs,
     r"values \(E,\), got \(\)": lambda: guided(FieldGradient(lambda position: position.sum(-1))).specs,
-    r"\(2, 3\), \(2, 2\)": lambda: guided(GradientHeading(["field", "move", "field_gradient"])).specs,
+    r"\(2, 3\), \(2, 2\)": lambda: guided(GradientHeading(["field", "leg", "field_gradient"])).specs,
     r"\[0, 3\].*\(2, 3\)": lambda: guided(GradientHeading(pair=(0, 3))).specs,
 }
 

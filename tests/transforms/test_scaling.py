@@ -16,17 +16,17 @@ from magrl.transforms import MinMaxNorm
 
 
 def minmax_nav() -> MinMaxNorm:
-    return MinMaxNorm(["field", "move"], ["f", "m"], ["action"])
+    return MinMaxNorm(["field", "leg"], ["f", "m"], ["action"])
 
 
 def test_env_values_come_from_the_spec_bounds() -> None:
-    env = TransformedEnv(nav(5), MinMaxNorm(["field", "move"], ["f", "m"]))
+    env = TransformedEnv(nav(5), MinMaxNorm(["field", "leg"], ["f", "m"]))
     td = env.rollout(4)
     spec = env.base_env.observation_spec["field"].space
     low, high = spec.low[0], spec.high[0]
     assert low.shape == (3,)
     torch.testing.assert_close((td["f"] + 1) / 2 * (high - low) + low, td["field"], rtol=1e-5, atol=1e-3)
-    distance, turn = td["next", "move"].unbind(-1)
+    distance, turn = td["next", "leg"].unbind(-1)
     expected = torch.stack((distance / 25 - 1, turn / (math.pi / 2)), -1)
     torch.testing.assert_close(td["next", "m"], expected, rtol=1e-6, atol=1e-6)
 
@@ -37,7 +37,7 @@ def test_env_gets_physical_actions_and_the_data_keep_scaled_ones() -> None:
     step = env.step(env.reset().set("action", scaled.clone()))
     assert torch.equal(step["action"], scaled)
     physical = torch.tensor([[0.0, -math.pi / 2], [25.0, math.pi / 4], [50.0, math.pi / 2]])
-    torch.testing.assert_close(step["next", "move"], physical, rtol=1e-6, atol=0)
+    torch.testing.assert_close(step["next", "leg"], physical, rtol=1e-6, atol=0)
 
 
 def test_state_scaled_both_ways_leaves_the_env_as_it_was() -> None:
@@ -87,7 +87,7 @@ def test_loaded_bounds_are_kept_elsewhere_and_those_of_a_clone_are_of_its_own_en
     for each in (loaded, alone):
         each.load_state_dict(norm.state_dict())
     assert torch.equal(alone(td.exclude("f", "m"))["f"], td["f"])
-    assert torch.equal(alone.inv(td)["action"], td["next", "move"])
+    assert torch.equal(alone.inv(td)["action"], td["next", "leg"])
     for part in (loaded, other):
         base = GeomagneticNavEnv(Scenario(region=Region((30, 40), (0, 10))), num_envs=3, seed=0)
         assert (TransformedEnv(base, part).reset()["f"].abs().max() <= 1) == (part is other)

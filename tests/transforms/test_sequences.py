@@ -10,15 +10,15 @@ from magrl.transforms import ReadingObservation
 from magrl.transforms.sequences import features
 
 GRADIENT = torch.tensor([[0.01, -0.002], [0.004, 0.008], [3.0, -5.0]])  # D, I [deg/km], B_H [nT/km]; north, east
-START, WAY = torch.tensor([3.0, 60.0, 20000.0]), torch.tensor([120.0, -200.0])
+START, DISPLACEMENT = torch.tensor([3.0, 60.0, 20000.0]), torch.tensor([120.0, -200.0])
 
 
 def flight(heading: float, km: float, **accuracy: Tensor) -> TensorDict:
-    """The observations at a start and after a move."""
-    there = {"target_field": (START + GRADIENT @ WAY)[None], "heading": torch.tensor([[heading]]), **accuracy}
-    displacement = km * torch.tensor([math.cos(heading), math.sin(heading)])
-    first = TensorDict(field=START[None], move=torch.zeros(1, 2), **there, batch_size=1)
-    after = TensorDict(field=(START + GRADIENT @ displacement)[None], move=torch.tensor([[km, 0.3]]), **there)
+    """The observations at a start and after a leg."""
+    there = {"target_field": (START + GRADIENT @ DISPLACEMENT)[None], "heading": torch.tensor([[heading]]), **accuracy}
+    leg = km * torch.tensor([math.cos(heading), math.sin(heading)])
+    first = TensorDict(field=START[None], leg=torch.zeros(1, 2), **there, batch_size=1)
+    after = TensorDict(field=(START + GRADIENT @ leg)[None], leg=torch.tensor([[km, 0.3]]), **there)
     observe = ReadingObservation([*ReadingObservation.default_in_keys, *accuracy])
     return observe(observe(first).set("next", after))
 
@@ -39,12 +39,12 @@ def test_the_features_by_hand() -> None:
 
 def test_a_start_has_no_change() -> None:
     first = flight(0.5, 20.0)["observation"][0]
-    assert torch.equal(first[:12], features(START, START + GRADIENT @ WAY))
+    assert torch.equal(first[:12], features(START, START + GRADIENT @ DISPLACEMENT))
     assert not first[12:17].any()
     torch.testing.assert_close(first[17:20], torch.tensor([math.cos(0.5), math.sin(0.5), 0.0]))
 
 
-def test_the_change_of_the_reading_is_along_the_move() -> None:
+def test_the_change_of_the_reading_is_along_the_leg() -> None:
     for heading in (0.5, -2.0):
         step = flight(heading, 20.0)["next"]
         seen, at = step["observation"][0], step["field"][0]

@@ -87,9 +87,9 @@ def test_without_noise_it_finds_gradient_and_destination() -> None:
     true, local = elements_gradient_at(env.field, after["position"]), after["track", "local"]
     error = (local["gradient"] - true) / torch.tensor((0.004, 0.015, 4.0)).unsqueeze(-1)
     assert error.norm(dim=(-2, -1)).median() < 0.05
-    way_km, bearing = geodesic(*after["position"].T, *after["target_position"].T)
-    true_way = (way_km * torch.stack((bearing.cos(), bearing.sin()))).T.float()
-    assert ((after["track", "way", "displacement"] - true_way).norm(dim=-1) / way_km).median() < 0.05
+    distance_km, bearing = geodesic(*after["position"].T, *after["target_position"].T)
+    true_displacement = (distance_km * torch.stack((bearing.cos(), bearing.sin()))).T.float()
+    assert ((after["track", "displacement", "mean"] - true_displacement).norm(dim=-1) / distance_km).median() < 0.05
 
 
 # Declarations
@@ -105,7 +105,7 @@ def test_the_declaration_is_that_of_the_pure_function() -> None:
     for row in found.unbind(1):
         action, decision = declaring(rules, track_of(row["track"]), reading_of(row), row["action"])
         torch.testing.assert_close(row["arrival_probability"].squeeze(-1), decision.probability.float())
-        torch.testing.assert_close(row["next", "move"], action[:, :2])
+        torch.testing.assert_close(row["next", "leg"], action[:, :2])
         assert torch.equal(row["next", "declared"].squeeze(-1), action[:, 2] > 0)
     assert found["next", "declared"].any()
 
@@ -158,7 +158,7 @@ def under(transform: Transform, **options: object) -> TransformedEnv:
 
 
 MISTAKES: dict[str, Callable[[], object]] = {
-    r"reads 'move' as .*3\), got \(2, 2\)": lambda: under(TrackField(in_keys=["move", *READ_KEYS[1:]])).specs,
+    r"reads 'leg' as .*3\), got \(2, 2\)": lambda: under(TrackField(in_keys=["leg", *READ_KEYS[1:]])).specs,
     "optional must be one of 'sensor_std', .*'readings'": lambda: TrackField(optional=["readings"]),
     r"third number .*\(2, 2\)": lambda: under(DeclareArrival(Rules(arrival="declared"))).specs,
     r"reads 'track', .*add a TrackField": lambda: (

@@ -12,7 +12,7 @@ import torch
 from support.tracks import f64
 
 from magrl.field import IGRF, elements_at
-from magrl.geodesy import geodesic, move_place
+from magrl.geodesy import geodesic, move_place, polar
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import advance, earth_model
 from magrl.tracking.belief import PLACE, Motion, at_place, settled, updated
@@ -26,8 +26,8 @@ NEAR = (60.43, 5.3)
 
 def at(north_km: float, east_km: float = 0.0) -> list[float]:
     """The elements so far from Bergen."""
-    way = f64(north_km, east_km)
-    return elements_at(FIELD, move_place(f64(*BERGEN), torch.atan2(way[1], way[0]), way.norm())).tolist()
+    distance, bearing = polar(f64(north_km, east_km))
+    return elements_at(FIELD, move_place(f64(*BERGEN), bearing, distance)).tolist()
 
 
 def begun(**known: Any) -> Onboard:
@@ -68,13 +68,13 @@ def test_a_vehicle_has_not_arrived_by_readings_that_do_not_fit() -> None:
 
 
 def test_the_elements_of_the_destination_count_where_they_are_given() -> None:
-    """With a model of 2020, what is measured at the destination tells a vehicle more of the field on its way."""
+    """With a model of 2020, what is measured at the destination tells a vehicle more of the field on its path."""
     place, given = (61.4, 9.3), elements_at(FIELD, f64(61.4, 9.3)).tolist()
-    ways = []
+    found = []
     for more in ({}, {"target_elements": given, "target_std": (0.02, 0.02, 2.0)}):
         vehicle = begun(target=place, start_km=5.0, model="IGRF-2020", **more)
         vehicle.step(*at(0.0), heading=60.0)
-        ways.append(vehicle.step(*at(10.0, 17.3), heading=60.0, distance=20.0).confidence)
+        found.append(vehicle.step(*at(10.0, 17.3), heading=60.0, distance=20.0).confidence)
         assert (vehicle.target == pytest.approx(given, rel=1e-6)) == bool(more)
     assert begun(target=given, start_km=5.0, target_std=(0.1, 0.1, 9.0))._rules.target_std == (0.1, 0.1, 9.0)
 
@@ -293,7 +293,7 @@ def test_a_vehicle_goes_on_to_another_destination_with_what_it_learned(model: st
     vehicle.retarget(place, **survey)
     vehicle.save(tmp_path / "flight.json")
     after = vehicle.step(*at(56.0), heading=0.0)
-    assert after.way_km == pytest.approx((0.0, 56.0), abs=8.0)
+    assert after.displacement_km == pytest.approx((0.0, 56.0), abs=8.0)
     assert after.turn_deg == pytest.approx(90.0, abs=15.0)
     assert after.place_covariance_km2[0][0] <= commands[-1].place_covariance_km2[0][0]
     again = Onboard("kalman", sensor_std=(0.02, 0.02, 2.0), confidence=0.9)

@@ -145,7 +145,7 @@ def test_a_mistake_is_named(row: int, tmp_path: Path, monkeypatch) -> None:
 
 BAD: tuple[Any, ...] = ("73", True, np.bool_(True), [73.0], torch.tensor([73.0]), math.nan, -math.inf, 1e9, -1e9)
 """Of no number's type, not finite, or beyond what any vehicle has."""
-OPTIONS = {"max_move_km": 50.0, "max_turn_deg": 60.0, "max_steps": 9, "radius_km": 9.0, "confidence": 0.5}
+OPTIONS = {"max_leg_km": 50.0, "max_turn_deg": 60.0, "max_steps": 9, "radius_km": 9.0, "confidence": 0.5}
 OPTIONS |= {"range_km": 400.0, "north": "true", "sensor_std": NOISE}
 STEP = {"declination": 3.5, "inclination": 73.0, "horizontal_intensity": 15e3, "heading": 290.0, "distance": 0.0}
 

@@ -55,7 +55,7 @@ def navigator(name: str, env: GeomagneticNavEnv, sensor_std: SensorStd | Triple 
 
 def numbers(state: TensorDictBase) -> tuple[float, ...]:
     """What a vehicle reads in a state of the environment: D, I, B_H, heading [deg] and distance [km]."""
-    return (*state["field"][0].tolist(), math.degrees(state["heading"].item()), state["move"][0, 0].item())
+    return (*state["field"][0].tolist(), math.degrees(state["heading"].item()), state["leg"][0, 0].item())
 
 
 def begun(
@@ -89,7 +89,7 @@ def fly(env: EnvBase, policy: Navigator, vehicle: Onboard, limit: int = 99, none
 
 def check(command: Command, state: TensorDictBase, after: TensorDictBase) -> None:
     """The command is the action of the environment, and the probability that of its navigator."""
-    distance, turn = after["move"][0].tolist()
+    distance, turn = after["leg"][0].tolist()
     assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
     off = command.heading_deg - math.degrees(after["heading"].item())
     assert math.remainder(off, 360) == pytest.approx(0, abs=0.05)
@@ -153,10 +153,10 @@ def test_a_start_that_is_hardly_known_shows_no_constant_error() -> None:
         for start in ((HERE, (50.0, 20.0, 5000.0)), ())
     )
     place = torch.zeros(2)
-    for way in ([0.0, 0.0], [30.0, 0.0], [0.0, 30.0], [20.0, 20.0]):
-        place, course = place + torch.tensor(way), math.degrees(math.atan2(way[1], way[0]))
+    for leg in ([0.0, 0.0], [30.0, 0.0], [0.0, 30.0], [20.0, 20.0]):
+        place, course = place + torch.tensor(leg), math.degrees(math.atan2(leg[1], leg[0]))
         reading = torch.tensor(HERE) + torch.tensor([0.9, 0.4, -80.0]) + SLOPE @ place
-        found, wanted = (vehicle.step(*reading.tolist(), course, math.hypot(*way)) for vehicle in (told, untold))
+        found, wanted = (vehicle.step(*reading.tolist(), course, math.hypot(*leg)) for vehicle in (told, untold))
         assert (found.stop, found.distance_km) == (None, pytest.approx(wanted.distance_km, abs=0.1))
         assert math.remainder(found.heading_deg - wanted.heading_deg, 360) == pytest.approx(0, abs=0.1)
 
@@ -169,8 +169,8 @@ def region_policy() -> FieldPolicy:
 def test_commands_of_own_policies() -> None:
     """One that reads the turn and the field of a region; its own limits and range count."""
     base, policy = nav(), region_policy()
-    vehicle = begun(policy, base.reset()["target_field"][0].tolist(), max_move_km=200.0)
-    assert vehicle.options.max_move_km == pytest.approx(50.0)
+    vehicle = begun(policy, base.reset()["target_field"][0].tolist(), max_leg_km=200.0)
+    assert vehicle.options.max_leg_km == pytest.approx(50.0)
     for command, state, _ in fly(base, policy, vehicle, 6):
         action = policy(state.clone())["action"][0].tolist()
         assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx(action, abs=1e-5)
@@ -184,18 +184,18 @@ def test_commands_of_own_policies() -> None:
     assert (command.stop, command.distance_km) == ("out of range", 0.0)
 
 
-def test_a_file_of_a_pilot_and_shorter_moves(tmp_path: Path) -> None:
+def test_a_file_of_a_pilot_and_shorter_legs(tmp_path: Path) -> None:
     """As flown by its own network, with all rules that it was trained for but those that are given."""
     rules, network = load_pilot(pretrained("anywhere"))
     save_pilot(tmp_path / "own.safetensors", rules.replace(range_km=800.0), network)
-    file = begun(str(tmp_path / "own.safetensors"), max_move_km=20.0)
-    same = begun(Anywhere(Rules(range_km=800.0, max_steps=120), source=network), max_move_km=20.0)
+    file = begun(str(tmp_path / "own.safetensors"), max_leg_km=20.0)
+    same = begun(Anywhere(Rules(range_km=800.0, max_steps=120), source=network), max_leg_km=20.0)
     assert file.options.range_km == same.options.range_km == 800.0
     places = [(*HERE, 290.0), SECOND, (3.4, 73.1, 14980.0, 0.0, 15.0)]
     commands = [file.step(*place) for place in places]
     assert commands == [same.step(*place) for place in places]
     assert 15 < max(command.distance_km for command in commands) <= 20
-    assert begun(max_move_km=60.0, name="anywhere").options.max_move_km == 50.0  # as trained
+    assert begun(max_leg_km=60.0, name="anywhere").options.max_leg_km == 50.0  # as trained
 
 
 # What runs
@@ -270,10 +270,10 @@ def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
     assert begun().step(*HERE, 290.0).reason == "the sign of D and the compass were not checked: give the start"
 
 
-# Moves and messages
+# Legs and messages
 
 
-def test_a_way_that_is_longer_than_a_move_is_reported_in_parts() -> None:
+def test_a_displacement_that_is_longer_than_a_leg_is_reported_in_parts() -> None:
     """The path of all parts explains the change of I and B_H; that D is the same at both ends is no stuck sensor."""
     after, vehicle = (3.5, 79.0, 9000.0), begun(sensor_std=NOISE)
     before = vehicle.step(*HERE, 0.0)
@@ -318,7 +318,7 @@ def test_a_state_of_another_vehicle_is_refused(tmp_path: Path) -> None:
     vehicle.start(TARGET)
     vehicle.save(path)
     others = {"sensor_std": Onboard("secant"), "navigator": Onboard("kalman", sensor_std=NOISE)}
-    others["max_move_km"] = Onboard("secant", sensor_std=NOISE, max_move_km=20.0)
+    others["max_leg_km"] = Onboard("secant", sensor_std=NOISE, max_leg_km=20.0)
     for name, other in others.items():
         with pytest.raises(ValueError, match=f"another {name}, "):
             other.restore(path)
@@ -362,7 +362,7 @@ def test_a_changed_state_is_refused_and_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_readings_all_over_the_earth_are_taken() -> None:
-    """Of IGRF, 1900 and 2030; moves of 50 km eastward and northward up to 85 degrees of latitude."""
+    """Of IGRF, 1900 and 2030; legs of 50 km eastward and northward up to 85 degrees of latitude."""
     for date in ("1900-01-01", "2030-01-01"):
         latitude = torch.arange(-85.0, 85.1, 5.0, dtype=torch.float64)
         place = torch.cartesian_prod(latitude, torch.arange(-180.0, 180.0, 30.0, dtype=torch.float64))
@@ -379,7 +379,7 @@ def test_readings_all_over_the_earth_are_taken() -> None:
 
 
 def test_a_log_in_radians_at_middle_latitudes_is_never_an_arrival() -> None:
-    """A reading of 0.66 is possible at the magnetic equator; that it hardly changes along the way is not."""
+    """A reading of 0.66 is possible at the magnetic equator; that it hardly changes along the path is not."""
     place, command, distance = torch.tensor([26.0, 30.0]).double(), None, 0.0
 
     def reading(latitude: float, longitude: float) -> list[float]:
@@ -423,7 +423,7 @@ def test_the_last_step_stops_and_says_how_near() -> None:
     ids=["right", "-I", "vertical"],
 )
 def test_readings_of_no_field_are_noticed(sign: float, zero: float, lost: bool) -> None:
-    """Inclinations with another sign, or from the vertical, have a curl and a divergence after two moves."""
+    """Inclinations with another sign, or from the vertical, have a curl and a divergence after two legs."""
     latitude, longitude, heading = (torch.tensor(x, dtype=torch.float64) for x in (30.0, 30.0, 1.0))
     stops = []
     for step in range(4):
@@ -438,7 +438,7 @@ def test_readings_of_no_field_are_noticed(sign: float, zero: float, lost: bool) 
 
 
 @pytest.mark.parametrize(
-    ("held", "std", "moves", "reason"),
+    ("held", "std", "legs", "reason"),
     [
         ((0, 1, 2), (0.5, 0.5, 50.0), 2, "no change of D, I, B_H over 100 km: a sensor is stuck"),
         ((1,), (0.5, 0.5, 50.0), 8, "no change of I over 400 km: a sensor is stuck"),
@@ -446,8 +446,8 @@ def test_readings_of_no_field_are_noticed(sign: float, zero: float, lost: bool) 
         ((1,), (NOISE[0], 1e4, NOISE[2]), None, ""),
     ],
 )
-def test_a_stuck_sensor(held: tuple[int, ...], std: Triple, moves: int | None, reason: str) -> None:
-    """Moves of 50 km along which readings change, but those of a sensor that always shows the same; where it is stated
+def test_a_stuck_sensor(held: tuple[int, ...], std: Triple, legs: int | None, reason: str) -> None:
+    """Legs of 50 km along which readings change, but those of a sensor that always shows the same; where it is stated
     as useless, it never ends a flight, even with an inclination that looks like radians."""
     radians = std[1] == 1e4
     here, target = ((3.5, 1.3, 30000.0), (-1.0, 4.0, 30500.0)) if radians else (HERE, TARGET)
@@ -455,9 +455,9 @@ def test_a_stuck_sensor(held: tuple[int, ...], std: Triple, moves: int | None, r
     for step in range(9):
         reading = [x + (0.01, 0.02, 2.0)[n] * step * (n not in held) for n, x in enumerate(here)]
         command = vehicle.step(*reading, 290.0, 50.0 if step else 0.0)
-        assert (command.stop == "lost") == (step == moves)
+        assert (command.stop == "lost") == (step == legs)
         assert math.isfinite(command.turn_deg + command.error_km)
-        if step == moves:
+        if step == legs:
             assert command.reason == reason
             break
 

@@ -114,7 +114,7 @@ def test_the_altitude_counts() -> None:
     assert (high - low).mean() == pytest.approx(log()["B_H"].mean() / 6, rel=0.1)
 
 
-def test_moves_are_compared_without_a_date() -> None:
+def test_legs_are_compared_without_a_date() -> None:
     (text,) = mistakes(log().assign(D=0.0, heading=log()["heading"] + 180))
     assert text.endswith(": the heading is reciprocal, or the vehicle goes astern")
 

@@ -34,7 +34,7 @@ reading to which another error is added, would reveal that field or that reading
 
 EPISODE_STREAM = "episode_stream"
 """Key of the environment's number of an episode, from which random numbers derive: ``(..., 1)`` int64, privileged."""
-DISPLACEMENT = "displacement"
+LEG_ERROR = "leg_error"
 """Key of what the environment adds to a commanded leg, northward and eastward ``(..., 2)`` [km]."""
 
 
@@ -177,17 +177,17 @@ class EpisodeErrors(EpisodeNumbers):
         """
         return SensorStd(*(torch.zeros_like(field) for _ in STD_KEYS))
 
-    def farthest_km(self, max_move_km: float) -> float:
+    def farthest_km(self, max_leg_km: float) -> float:
         """Return the longest path on the ground of a commanded leg [km].
 
         Args:
-            max_move_km: longest leg that a policy may command [km].
+            max_leg_km: longest leg that a policy may command [km].
 
         Raises:
             ValueError: for a leg that is not above 0.
         """
-        check_number(0, above=True, max_move_km=max_move_km)
-        return max_move_km
+        check_number(0, above=True, max_leg_km=max_leg_km)
+        return max_leg_km
 
 
 def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:

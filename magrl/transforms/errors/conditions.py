@@ -15,7 +15,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from magrl.checks import check_number, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
-from magrl.transforms.errors.base import DISPLACEMENT, TYPICAL_FIELD, EpisodeErrors
+from magrl.transforms.errors.base import LEG_ERROR, TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NorthReferenceError
 from magrl.transforms.errors.sensors import SensorErrors
@@ -30,8 +30,8 @@ ERRORS: dict[str, type[EpisodeErrors]] = {
     "north": NorthReferenceError,
 }
 """Errors by their names in files, in the order of an environment. An error of one's own is a further row."""
-MOVE_KM = 50.0
-"""Move that the noise of a log belongs to [km]."""
+LEG_KM = 50.0
+"""Leg that the noise of a log belongs to [km]."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,13 @@ class Conditions:
         """The errors, built once: what a vehicle knows of them does not depend on a seed."""
         return self.transforms()
 
-    def drift_km(self, max_move_km: float) -> float:
+    def drift_km(self, max_leg_km: float) -> float:
         """Return how much farther than a longest leg the errors may carry a vehicle, rounded up [km].
 
         It is at least 1 with errors of motion: they turn a leg, which an environment without drift does not allow.
 
         Args:
-            max_move_km: longest leg that a policy may command [km].
+            max_leg_km: longest leg that a policy may command [km].
 
         Raises:
             ValueError: for a leg that is not above 0.
@@ -109,8 +109,8 @@ class Conditions:
             >>> CONDITIONS["laboratory"].drift_km(50.0), CONDITIONS["ship"].drift_km(50.0)
             (0.0, 4.0)
         """
-        added = [error.farthest_km(max_move_km) - max_move_km for error in self._errors]
-        moved = any(DISPLACEMENT in error.true_keys for error in self._errors)
+        added = [error.farthest_km(max_leg_km) - max_leg_km for error in self._errors]
+        moved = any(LEG_ERROR in error.true_keys for error in self._errors)
         return float(max(moved, math.ceil(max(added, default=0.0))))
 
     @cached_property
@@ -138,7 +138,7 @@ class Conditions:
         north = self.std.bias[0] if math.isfinite(self.std.bias[0]) else 0.0
         shares = log, motion.current_km_h / self.speed_km_h, math.radians(north)
         eddies = (motion.eddies_km_h / self.speed_km_h) ** 2 / 2 * motion.eddy_km / math.pi
-        random = eddies + noise**2 / 2 * MOVE_KM
+        random = eddies + noise**2 / 2 * LEG_KM
         return math.hypot(*shares) / math.sqrt(2), math.sqrt(random)
 
 
@@ -209,7 +209,7 @@ def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -
     """Return an environment under conditions, or the environment itself if they have no error.
 
     Args:
-        env: navigation environment; errors of motion need ``drift_km=conditions.drift_km(max_move_km)``.
+        env: navigation environment; errors of motion need ``drift_km=conditions.drift_km(max_leg_km)``.
         conditions: conditions, or the name of a preset.
         seed: seed of the errors.
 

@@ -14,7 +14,7 @@ from magrl.checks import check_number
 from magrl.counters import NORMAL_LIMIT, normal_of, stream_normal, stream_uniform
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
 from magrl.transforms.base import observed_spec
-from magrl.transforms.errors.base import DISPLACEMENT, Episode, EpisodeErrors
+from magrl.transforms.errors.base import LEG_ERROR, Episode, EpisodeErrors
 
 EDDIES = 8
 """Number of waves of which a field of eddies is the sum."""
@@ -23,10 +23,10 @@ EDDIES = 8
 class MotionError(EpisodeErrors):
     """Move the vehicle elsewhere than it believes: errors of its log and of its compass in motion, and currents.
 
-    A policy chooses a distance and a turn, and believes that it moves so: ``move`` and ``heading`` are what was
+    A policy chooses a distance and a turn, and believes that it moves so: ``leg`` and ``heading`` are what was
     commanded. On the ground the vehicle goes the distance times ``1 + scale + noise``, along its heading plus the
     errors of the compass in motion, plus the current times the distance over the speed. The difference from the command
-    is written as ``displacement``, which the environment adds. The heading itself is right, so a declination measured
+    is written as ``leg_error``, which the environment adds. The heading itself is right, so a declination measured
     from it is, too; see :class:`~magrl.transforms.NorthReferenceError` for the contrary.
 
     Sizes are standard deviations of normal errors, cut at four of them, so that the farthest leg is known
@@ -60,16 +60,16 @@ class MotionError(EpisodeErrors):
         >>> errors = MotionError(log_scale=0.1, fixed=True)
         >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=1, seed=0, drift_km=5.0), errors)
         >>> after = env.step(env.reset().set("action", torch.tensor([[50.0, 0.5]])))["next"]
-        >>> after["move"], after["true_move"]
+        >>> after["leg"], after["true_leg"]
         (tensor([[50.0000,  0.5000]]), tensor([[55.0000,  0.5000]]))
     """
 
     channel = 4
-    default_in_keys = ("move", "heading", "position")
-    default_out_keys = ("true_move", "true_course")
-    true_keys = (*default_out_keys, DISPLACEMENT)
+    default_in_keys = ("leg", "heading", "position")
+    default_out_keys = ("true_leg", "true_course")
+    true_keys = (*default_out_keys, LEG_ERROR)
     numbers_key, stream_key = "motion_error", "motion_stream"
-    in_sizes = {"move": (2,), "heading": (1,), "position": (2,)}
+    in_sizes = {"leg": (2,), "heading": (1,), "position": (2,)}
     step_draws = 2  # one is used: published numbers rest on the stride, and on phases that are drawn without eddies
 
     def __init__(
@@ -106,7 +106,7 @@ class MotionError(EpisodeErrors):
         scale = (self.log[0],) * 2 if self.fixed else (-NORMAL_LIMIT * self.log[0], NORMAL_LIMIT * self.log[0])
         return 1 + scale[0] - noise, 1 + scale[1] + noise
 
-    def farthest_km(self, max_move_km: float) -> float:
+    def farthest_km(self, max_leg_km: float) -> float:
         """Return the longest path on the ground of a commanded leg [km].
 
         Example:
@@ -114,7 +114,7 @@ class MotionError(EpisodeErrors):
             57.00000000000001
         """
         currents = self.current_km_h + math.sqrt(3 * EDDIES) * self.eddies_km_h
-        return super().farthest_km(max_move_km) * (self._stretch[1] + currents / self.speed_km_h)
+        return super().farthest_km(max_leg_km) * (self._stretch[1] + currents / self.speed_km_h)
 
     # Data
 
@@ -130,12 +130,10 @@ class MotionError(EpisodeErrors):
         values = self._read(tensordict, [*self.in_keys_inv, self.in_keys[2]])
         state = self._state(tensordict)
         if values is not None and state is not None:
-            tensordict.set(DISPLACEMENT, self._displacement(*values, *state))
+            tensordict.set(LEG_ERROR, self._leg_error(*values, *state))
         return tensordict
 
-    def _displacement(
-        self, action: Tensor, heading: Tensor, position: Tensor, errors: Tensor, stream: Tensor
-    ) -> Tensor:
+    def _leg_error(self, action: Tensor, heading: Tensor, position: Tensor, errors: Tensor, stream: Tensor) -> Tensor:
         """Return the leg on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
         distance, turn = action[..., :2].double().unbind(-1)
         bow, errors = wrap_angle(heading[..., 0] + turn), errors.double()
@@ -143,24 +141,24 @@ class MotionError(EpisodeErrors):
         stretch = stream_normal(stream.squeeze(-1), 1).squeeze(-1)
         through = distance * (1 + scale + self.log[1] * stretch)
         course = bow + torch.deg2rad(compass)
-        displacement = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
+        added = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
         hours = (distance / self.speed_km_h).unsqueeze(-1)
-        displacement = displacement + hours * self.current_km_h * _unit(direction)
+        added = added + hours * self.current_km_h * _unit(direction)
         if self.eddies_km_h:
             phases, directions = errors[..., 3:].tensor_split([EDDIES], -1)
             velocity = eddy_velocity(position, eddy_waves(directions, self.eddy_km), phases)
-            displacement = displacement + hours * self.eddies_km_h * velocity
-        return displacement
+            added = added + hours * self.eddies_km_h * velocity
+        return added
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         """Write the true leg and its direction."""
-        move, heading, _ = values
+        leg, heading, _ = values
         if not episode.first:
-            distance, bow = move[..., 0].double(), heading[..., 0].double()
-            distance, course = polar(displaced(distance, bow, tensordict[DISPLACEMENT]))
-            move = torch.stack((distance, move[..., 1].double()), -1).to(move.dtype)
+            distance, bow = leg[..., 0].double(), heading[..., 0].double()
+            distance, course = polar(displaced(distance, bow, tensordict[LEG_ERROR]))
+            leg = torch.stack((distance, leg[..., 1].double()), -1).to(leg.dtype)
             heading = torch.where(distance > 0, course, heading[..., 0]).unsqueeze(-1).to(heading.dtype)
-        tensordict.set(self.out_keys[0], move).set(self.out_keys[1], heading)
+        tensordict.set(self.out_keys[0], leg).set(self.out_keys[1], heading)
         return episode.numbers
 
     # Specs
@@ -168,8 +166,8 @@ class MotionError(EpisodeErrors):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the true leg, its direction, the errors and the state of the numbers."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        move, heading, _ = (observation_spec[key] for key in self.in_keys)
-        self._add(observation_spec, move, self.out_keys[0], 2)
+        leg, heading, _ = (observation_spec[key] for key in self.in_keys)
+        self._add(observation_spec, leg, self.out_keys[0], 2)
         observation_spec[self.out_keys[1]] = heading.clone()
         return observation_spec
 
@@ -183,7 +181,7 @@ class MotionError(EpisodeErrors):
         if self.parent is None:
             return input_spec
         commanded = float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max())
-        spec = observed_spec(self).get(DISPLACEMENT, None)
+        spec = observed_spec(self).get(LEG_ERROR, None)
         allowed = 0.0 if spec is None else float(spec.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded
         if spec is None or drift > allowed + 1e-6 * commanded:

@@ -90,7 +90,7 @@ class NorthReferenceError(ReadingErrors):
 
     channel, changes_inclination = 3, False
     true_keys = ("true_field", "true_heading")
-    default_in_keys = ("heading", "field", "move")
+    default_in_keys = ("heading", "field", "leg")
     default_out_keys = ("heading", "field")
     optional_in_keys = ("position",)
     numbers_key, stream_key = "north_error", "north_stream"
@@ -152,11 +152,11 @@ class NorthReferenceError(ReadingErrors):
         return pad(self.sizes[0] * (torch.ones_like(normal) if self.fixed else normal), (0, 2))
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        heading, field, move, *position = values
+        heading, field, leg, *position = values
         errors, stream, first = episode
         constant, drift, _ = errors.split(1, -1)
         walk, white = stream_normal(stream, 2).to(errors.dtype).split(1, -1)
-        drift = gauss_markov(drift, self.sizes[1], math.inf if first else move[..., :1], self.drift_length_km, walk)
+        drift = gauss_markov(drift, self.sizes[1], math.inf if first else leg[..., :1], self.drift_length_km, walk)
         error = constant + drift + self.sizes[2] * white
         if position:
             error = error / torch.cos(torch.deg2rad(position[0][..., :1])).to(error.dtype)
@@ -215,6 +215,6 @@ def north_reference(name: str, *, speed_km_h: float, **options: Any) -> NorthRef
     """
     check_choice(NORTH_REFERENCES, north_reference=name)
     check_number(0, above=True, speed_km_h=speed_km_h)
-    keys = ("heading", "field", "move") if name == "low-cost" else ("heading", "field", "move", "position")
+    keys = ("heading", "field", "leg") if name == "low-cost" else ("heading", "field", "leg", "position")
     options = {**NORTH_REFERENCES[name], "drift_length_km": SCHULER_HOURS * speed_km_h, "in_keys": keys, **options}
     return NorthReferenceError(**options)

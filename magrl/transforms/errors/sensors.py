@@ -75,8 +75,8 @@ class SensorErrors(ReadingErrors):
     """
 
     channel = 2
-    default_in_keys = ("field", "move", "heading")
-    optional_in_keys = ("move", "heading")
+    default_in_keys = ("field", "leg", "heading")
+    optional_in_keys = ("leg", "heading")
     numbers_key, stream_key = "sensor_error", "sensor_stream"
     _sizes: Tensor
 

@@ -30,7 +30,7 @@ class MagneticWeather(ReadingErrors):
     ``distance / speed`` and :data:`READING_S`. The variation of the minute in which the step ends is added to the field
     vector; between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the
     record, wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the
-    time of ``way_km``, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    time of ``trip_km``, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     ``field`` becomes the measured field, and ``true_field`` the field without weather, from which the environment
     computes arrival, objective and reward. In ``Compose``, the weather stands before the errors of the sensors.
@@ -40,8 +40,8 @@ class MagneticWeather(ReadingErrors):
         speed_km_h: speed of the vehicles [km/h].
         span_h: longest duration of an episode [h]: it starts where the record has no gap for that time; after it, the
             weather stays constant. By default the longest legs until the step
-            limit, where the environment has ``max_steps`` and ``max_move_km``.
-        way_km: distance of a trip, whose weather a vehicle expects [km].
+            limit, where the environment has ``max_steps`` and ``max_leg_km``.
+        trip_km: distance of a trip, whose weather a vehicle expects [km].
         surrogates: number of variations with the spectrum of the record and random phases
             (:meth:`~magrl.field.WeatherRecord.surrogates`), one of which each episode of a training gets: with an
             environment of a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`. Evaluations, with the seeds from there
@@ -67,7 +67,7 @@ class MagneticWeather(ReadingErrors):
     """
 
     channel = 7
-    default_in_keys = ("field", "move")
+    default_in_keys = ("field", "leg")
     numbers_key, stream_key = "weather_clock", "weather_stream"
     in_sizes = {"field": (3,)}
     size, numbers_dtype = 2, torch.float64
@@ -79,7 +79,7 @@ class MagneticWeather(ReadingErrors):
         *,
         speed_km_h: float,
         span_h: float | None = None,
-        way_km: float = 500.0,
+        trip_km: float = 500.0,
         surrogates: int = 0,
         **options: Any,
     ) -> None:
@@ -87,13 +87,13 @@ class MagneticWeather(ReadingErrors):
         self.record = weather_record(record) if isinstance(record, str) else record
         check_type(WeatherRecord, record=self.record)
         check_number(0, whole=True, surrogates=surrogates)
-        check_number(0, above=True, speed_km_h=speed_km_h, way_km=way_km)
+        check_number(0, above=True, speed_km_h=speed_km_h, trip_km=trip_km)
         check_number(0, optional=True, span_h=span_h)
         self.speed_km_h, self.span_h = float(speed_km_h), span_h
         self._starts_by_span: dict[float, Tensor] = {}
         drawn = self.record.surrogates(surrogates).flatten(0, 1) if surrogates else self.record.variation[:0]
         self.register_buffer("variation", torch.cat((self.record.variation, drawn)), persistent=False)
-        moments = self.record.second_moments(way_km / self.speed_km_h)
+        moments = self.record.second_moments(trip_km / self.speed_km_h)
         self.register_buffer("_moments", moments, persistent=False)
         self._set_accuracy()
         if span_h is not None:
@@ -103,13 +103,13 @@ class MagneticWeather(ReadingErrors):
         """Return the longest time of an episode [h]; by default for the longest legs until the step limit."""
         if self.span_h is not None:
             return self.span_h
-        steps, move_km = (getattr(self.parent, name, None) for name in ("max_steps", "max_move_km"))
-        if not isinstance(steps, Real) or not isinstance(move_km, Real):
+        steps, leg_km = (getattr(self.parent, name, None) for name in ("max_steps", "max_leg_km"))
+        if not isinstance(steps, Real) or not isinstance(leg_km, Real):
             raise ValueError(
                 "MagneticWeather needs span_h, the longest time that an episode takes [h]: there is no environment "
-                "with max_steps and max_move_km from which it follows, got span_h None"
+                "with max_steps and max_leg_km from which it follows, got span_h None"
             )
-        return float(steps) * (float(move_km) / self.speed_km_h + READING_S / 3600)
+        return float(steps) * (float(leg_km) / self.speed_km_h + READING_S / 3600)
 
     def _starts(self) -> Tensor:
         """Return the minutes at which an episode can start, ``(S,)`` int64."""
@@ -136,9 +136,9 @@ class MagneticWeather(ReadingErrors):
         return all(seed is not None and seed < paper.FIRST_RESERVED_SEED for seed in seeds)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        (field, move), (start, minutes) = values, episode.numbers.unbind(-1)
+        (field, leg), (start, minutes) = values, episode.numbers.unbind(-1)
         if not episode.first:
-            step_h = move[..., 0].double() / self.speed_km_h + READING_S / 3600
+            step_h = leg[..., 0].double() / self.speed_km_h + READING_S / 3600
             minutes = (minutes + 60 * step_h).clamp(max=60 * self._longest_h())
         vector = field_vector(field.double()) + self.variation[(start + minutes).long()]
         self._measure(tensordict, field, measured_elements(vector).to(field.dtype))

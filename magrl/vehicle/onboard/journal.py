@@ -19,8 +19,8 @@ from magrl.checks import CheckedModel
 from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
 from magrl.tracking import Rules
 from magrl.tracking.belief import CONSTANT, DRIFT, PLACE
+from magrl.tracking.displacement import Displacement
 from magrl.tracking.records import FARTHEST_START_KM, State
-from magrl.tracking.way import Way
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
@@ -174,7 +174,7 @@ class Journal(Destination):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[17] = 17
+    format: Literal[18] = 18
     options: Annotated[Options, _LAX]
     start: Annotated[tuple[float, ...], _LAX] | None = None
     start_std: Triple | None = None
@@ -207,8 +207,8 @@ class Command:
         distance_km: length of the leg; 0 to stay and read again.
         turn_deg: turn before the leg, to the right.
         heading_deg: heading after that turn, 0 to 360: what to steer.
-        way_km: mean of the displacement to the destination, northward and eastward.
-        way_covariance_km2: its covariance, by rows.
+        displacement_km: mean of the displacement to the destination, northward and eastward.
+        displacement_covariance_km2: its covariance, by rows.
         confidence: estimated probability that the destination is within ``radius_km`` of the options.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
             the distance is then 0.
@@ -233,8 +233,8 @@ class Command:
     distance_km: float
     turn_deg: float
     heading_deg: float
-    way_km: tuple[float, float]
-    way_covariance_km2: tuple[tuple[float, float], tuple[float, float]]
+    displacement_km: tuple[float, float]
+    displacement_covariance_km2: tuple[tuple[float, float], tuple[float, float]]
     confidence: float
     stop: str | None = None
     reason: str = ""
@@ -250,8 +250,8 @@ class Command:
 
     @property
     def error_km(self) -> float:
-        """Root mean square error of the estimated way: the root of the trace of its covariance [km]."""
-        return math.sqrt(self.way_covariance_km2[0][0] + self.way_covariance_km2[1][1])
+        """Root mean square error of the estimated displacement: the root of the trace of its covariance [km]."""
+        return math.sqrt(self.displacement_covariance_km2[0][0] + self.displacement_covariance_km2[1][1])
 
     @property
     def axes(self) -> tuple[float, float, float]:
@@ -259,7 +259,8 @@ class Command:
 
         The direction is from 0 to 180 [deg]. A long ellipse is a line on which the destination is.
         """
-        along, across, bearing = Way(torch.tensor(self.way_km), torch.tensor(self.way_covariance_km2)).axes()
+        moments = self.displacement_km, self.displacement_covariance_km2
+        along, across, bearing = Displacement(*map(torch.tensor, moments)).axes()
         return along.item(), across.item(), bearing.item()
 
 

@@ -236,32 +236,32 @@ def measured(std: Sequence[float]) -> tuple[bool, ...]:
     return tuple(value / slope < MISSING_KM for value, slope in zip(std, SLOPES, strict=True))
 
 
-def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Incomplete, move_km: float) -> Triple:
+def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Incomplete, leg_km: float) -> Triple:
     """Return the path since each element last changed ``(3,)`` [km], without legs that end without reading it.
 
     Args:
         unchanged: that path before the leg.
         before: D, I, B_H before the leg.
         after: the same after it; None for an element that was not read.
-        move_km: its length.
+        leg_km: its length.
 
     Example:
         >>> unchanged_km((30.0, 30.0, 30.0), (3.5, 73.0, 15000.0), (3.5, 73.1, None), 20.0)
         (50.0, 0.0, 30.0)
     """
     first, second, third = (
-        km if new is None else km + move_km if new == old else 0.0
+        km if new is None else km + leg_km if new == old else 0.0
         for km, old, new in zip(unchanged, before, after, strict=True)
     )
     return first, second, third
 
 
-def stuck(unchanged: Sequence[float], max_move_km: float, useful: Sequence[bool], hung: Sequence[bool]) -> str:
+def stuck(unchanged: Sequence[float], max_leg_km: float, useful: Sequence[bool], hung: Sequence[bool]) -> str:
     """Return which readings are from a stuck sensor, as text; empty if none is.
 
     Args:
         unchanged: from :func:`unchanged_km`.
-        max_move_km: longest leg.
+        max_leg_km: longest leg.
         useful: which elements are measured.
         hung: which of them are not read any more: they end a flight only if all are stuck.
 
@@ -269,7 +269,7 @@ def stuck(unchanged: Sequence[float], max_move_km: float, useful: Sequence[bool]
         >>> stuck((450.0, 20.0, 0.0), 50.0, (True, True, False), (False, False, False))
         'no change of D over 400 km: a sensor is stuck'
     """
-    every_km, one_km = (max(km, moves * max_move_km) for km, moves in zip(STUCK_KM, (2, 8), strict=True))
+    every_km, one_km = (max(km, legs * max_leg_km) for km, legs in zip(STUCK_KM, (2, 8), strict=True))
     rows = list(zip(NAMES, unchanged, useful, hung, strict=True))
     every = min((km for _, km, use, _ in rows if use), default=0.0) >= every_km
     least_km = every_km if every else one_km

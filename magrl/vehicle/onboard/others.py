@@ -57,7 +57,7 @@ class Other:
         ValueError: for an unknown name, or a navigator that reads more than a vehicle knows.
 
     Example:
-        >>> Other(Secant(max_move_km=20.0)).most["max_move_km"]
+        >>> Other(Secant(max_leg_km=20.0)).most["max_leg_km"]
         20.0
     """
 
@@ -78,7 +78,7 @@ class Other:
         view: Any = getattr(self.navigator, "view", self.navigator)
         self.most: dict[str, float] = {}
         if hasattr(view, "max_turn_rad") and not self._secant:
-            self.most = {"max_move_km": view.max_move_km, "max_turn_deg": math.degrees(view.max_turn_rad)}
+            self.most = {"max_leg_km": view.max_leg_km, "max_turn_deg": math.degrees(view.max_turn_rad)}
         self.range = getattr(view, "field_limits", ((-180.0, -90.0, 0.0), (180.0, 90.0, math.inf)))
 
     def begun(self, options: Options, reading: Reading) -> Other:
@@ -89,14 +89,14 @@ class Other:
             new.error, new.left = calibrated(reading, reading.known, reading.known_std)
         if self._secant:
             elements, std = NAMES[1:] if options.magnetic else NAMES, SensorStd(*(part.tolist() for part in new.left))
-            new.navigator = Secant(options.max_move_km, options.max_turn_rad, elements=elements, sensor_std=std)
+            new.navigator = Secant(options.max_leg_km, options.max_turn_rad, elements=elements, sensor_std=std)
         return new
 
-    def move(self, reading: Reading) -> Tensor:
+    def act(self, reading: Reading) -> Tensor:
         """Return distance [km] and turn [rad] ``(2,)`` after a reading."""
         turn, self.course = wrap_angle(reading.heading - self.course), reading.heading
         rows = {"field": element_difference(reading.field, self.error), "target_field": reading.target}
-        rows |= {"move": torch.stack((reading.distance, turn)), "heading": reading.heading.reshape(1)}
+        rows |= {"leg": torch.stack((reading.distance, turn)), "heading": reading.heading.reshape(1)}
         rows |= dict(zip(STD_KEYS, reading.std._replace(bias=self.left.bias), strict=True))
         seen = {key: row.float().unsqueeze(0) for key, row in rows.items()}
         seen |= {"elapsed_steps": reading.step.reshape(1, 1), "done": torch.zeros(1, 1, dtype=torch.bool)}

@@ -38,7 +38,7 @@ USUAL: dict[str, Any] = {
     "wander_km": 0.1,
 }
 """Rules of a vehicle, which replace the defaults of :class:`~magrl.tracking.Rules` and the training's."""
-LONGEST_WAY_KM = 2500.0
+LONGEST_DISPLACEMENT_KM = 2500.0
 """Estimated distance beyond which an agent without a map is out of range: there its observation saturates."""
 HIGHEST_LATITUDE = 85.0
 """Latitude beyond which a known place is out of range: its region of 90 % held 78 % of the places at 86 to 88° S."""
@@ -85,7 +85,7 @@ class Onboard:
 
             self._other = Other(navigator)
         given = Options(**rules.model_dump() | USUAL | options)
-        most = rules.model_dump(include={"max_move_km", "max_turn_deg"}) if self._network else {}
+        most = rules.model_dump(include={"max_leg_km", "max_turn_deg"}) if self._network else {}
         name, module = "anywhere" if self._network else "kalman", self._network or nn.Identity()
         self._range = ((-180.0, -90.0, limits.LEAST_NT), (180.0, 90.0, math.inf))
         if self._other:
@@ -272,8 +272,8 @@ class Onboard:
             if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
                 raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             network, other = self._network, self._other
-            move = other.move(reading) if other else act(self._rules, track, reading, network)
-            action, decision = declaring(self._rules, track, reading, move)
+            action = other.act(reading) if other else act(self._rules, track, reading, network)
+            action, decision = declaring(self._rules, track, reading, action)
         if some and (reading.known is not None or self._state is not None):
             doubt = doubt.after(track, first=self._state is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
@@ -303,7 +303,7 @@ class Onboard:
 
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
-        limits.check_leg(step.distance, step.distance_std, self.options.max_move_km)
+        limits.check_leg(step.distance, step.distance_std, self.options.max_leg_km)
         if self._state is not None:
             since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
             limits.check_earth_jump(self._last, elements, since_km, noise)
@@ -312,7 +312,7 @@ class Onboard:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
         if text := limits.out_of_range(self._within, elements):
             raise ValueError(f"the reading at the start: {text}")
-        longest = LONGEST_WAY_KM if self._network else self.options.max_steps * self.options.max_move_km
+        longest = LONGEST_DISPLACEMENT_KM if self._network else self.options.max_steps * self.options.max_leg_km
         limits.check_earth_distance(elements, self.target, longest)
 
     def _command(self, track: Track, decision: ArrivalDecision, action: Tensor, course: float) -> Command:
@@ -324,8 +324,8 @@ class Onboard:
         reason = reason if stop else self._doubt.text or reason
         distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
         steer = math.degrees(course + turn) % 360.0
-        north, east = track.way.displacement.tolist()
-        (nn, ne), (en, ee) = track.way.covariance.tolist()
+        north, east = track.displacement.mean.tolist()
+        (nn, ne), (en, ee) = track.displacement.covariance.tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
         found = estimates_of(track.state, located=self._rules.start_km is not None)
         return Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
@@ -339,9 +339,9 @@ class Onboard:
             return "out of range", text
         if self._rules.start_km is not None and abs(latitude := track.state.place[0].item()) > HIGHEST_LATITUDE:
             return "out of range", f"latitude {latitude:.1f}: the model is valid to {HIGHEST_LATITUDE:g} degrees"
-        way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
-        if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
-            return "out of range", f"{way_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_WAY_KM:g}"
+        left_km, error_km = track.displacement.mean.norm().item(), track.displacement.covariance.trace().sqrt().item()
+        if self._network and left_km - 2 * error_km > LONGEST_DISPLACEMENT_KM:
+            return "out of range", f"{left_km:.0f} ± {error_km:.0f} km to go, of at most {LONGEST_DISPLACEMENT_KM:g}"
         declare, last = decision.declare.item(), self._number >= options.max_steps - 1
         if not (declare or last) or doubt.level > LOST_SURPRISE:
             return None, ""
@@ -361,7 +361,7 @@ class Onboard:
         """Return why readings or legs cannot be from a vehicle, as text; empty if they can."""
         useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
-        if text := limits.stuck(self._unchanged, self.options.max_move_km, useful, self._doubt.hung):
+        if text := limits.stuck(self._unchanged, self.options.max_leg_km, useful, self._doubt.hung):
             return text
         if self._doubt.lost:
             return self._doubt.contradiction

@@ -66,7 +66,7 @@ class TypicalField(nn.Module):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
-    """At the latitude at which a dipole has the typical inclination; the weather of a ship over its way of 500 km."""
+    """At the latitude at which a dipole has the typical inclination; the weather of a ship over its trip of 500 km."""
     region = Scenario(region=Region((39, 43), (160, 170)))
     env = with_conditions(nav(1000, CONDITIONS[name].drift_km(50.0), scenario=region), name)
     env.base_env.field = TypicalField()
@@ -156,7 +156,7 @@ def test_navigators_are_told_what_they_can_tell_apart() -> None:
 
 @pytest.mark.parametrize("kind", [Kalman, Anywhere])
 def test_agents_heed_all_errors_that_are_stated(kind: type[Kalman]) -> None:
-    """Each kind changes the move; without a statement, readings are perfect."""
+    """Each kind changes the leg; without a statement, readings are perfect."""
     state, policy, told = nav(4).reset(), kind(), {}
 
     def action() -> torch.Tensor:

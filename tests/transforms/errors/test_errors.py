@@ -114,8 +114,8 @@ def test_data_without_an_environment() -> None:
     noise, north = SensorErrors(STD), NorthReferenceError(0.5, 0.3, 0.2, drift_length_km=100.0)
     steps = flown(under(noise.clone(), north.clone(), num_envs=3), actions(1, 3))
     plain = nav(3)
-    move = plain.step(steps[0].clone().set("heading", steps[0]["true_heading"]).set("action", actions(1, 3)[0]))
-    after = north(noise(steps[0].clone().set("next", move["next"])))["next"]
+    taken = plain.step(steps[0].clone().set("heading", steps[0]["true_heading"]).set("action", actions(1, 3)[0]))
+    after = north(noise(steps[0].clone().set("next", taken["next"])))["next"]
     for key in ("field", "heading", "true_field", "north_error"):
         assert torch.equal(after[key], steps[1][key]), key
 
@@ -125,7 +125,7 @@ def test_an_inclination_beyond_the_vertical_is_read_as_by_a_magnetometer() -> No
     errors = SensorErrors(bias=(0.0, 2.0, 0.0), fixed=True)
     true = torch.tensor([[170.0, 89.0, 900.0], [-20.0, 89.0, 900.0], [10.0, 80.0, 900.0], [10.0, -92.0, 900.0]])
     read = torch.tensor([[-10.0, 89.0, 900.0], [160.0, 89.0, 900.0], [10.0, 82.0, 900.0], [10.0, -90.0, 900.0]])
-    state = errors(TensorDict({"field": true, "move": torch.zeros(4, 2), "heading": torch.zeros(4, 1)}, 4))
+    state = errors(TensorDict({"field": true, "leg": torch.zeros(4, 2), "heading": torch.zeros(4, 1)}, 4))
     torch.testing.assert_close(state["field"], read)
     noisy = SensorErrors((0.0, 5.0, 0.0), in_keys=["field"])(TensorDict({"field": true[:1].expand(500, 3)}, 500))[
         "field"

@@ -33,21 +33,21 @@ def test_a_track_with_errors_is_that_of_a_numpy_integration() -> None:
     for action, state in zip(steps.double(), states[1:], strict=True):
         distance, turn = action.T.numpy()
         heading = heading + turn
-        way = distance * (1.1 * np.exp(1j * (heading + math.radians(15))) + drift)
-        ends = move(*position.unbind(-1), torch.tensor(np.angle(way)), torch.tensor(np.abs(way)))
+        leg = distance * (1.1 * np.exp(1j * (heading + math.radians(15))) + drift)
+        ends = move(*position.unbind(-1), torch.tensor(np.angle(leg)), torch.tensor(np.abs(leg)))
         position = torch.stack(ends, -1)
         torch.testing.assert_close(state["position"], position, atol=2e-6, rtol=0)  # 0.2 m
-        torch.testing.assert_close(state["move"], action.float())
+        torch.testing.assert_close(state["leg"], action.float())
         believed = np.angle(np.exp(1j * (state["heading"][:, 0].numpy() - heading)))
         assert np.abs(believed).max() < 1e-5
-        torch.testing.assert_close(state["true_move"][:, 0].double(), torch.tensor(np.abs(way)), rtol=1e-5, atol=0)
-        assert np.abs(np.angle(np.exp(1j * state["true_course"][:, 0].numpy()) / way)).max() < 1e-5
+        torch.testing.assert_close(state["true_leg"][:, 0].double(), torch.tensor(np.abs(leg)), rtol=1e-5, atol=0)
+        assert np.abs(np.angle(np.exp(1j * state["true_course"][:, 0].numpy()) / leg)).max() < 1e-5
 
 
-def test_noise_of_the_log_is_new_in_each_move() -> None:
+def test_noise_of_the_log_is_new_in_each_leg() -> None:
     env = TransformedEnv(nav(3000), MotionError(log_noise=0.02))
     states = flown(env, torch.tensor([[[50.0, 0.0]]]).expand(3, 3000, -1))[1:]
-    stretch = torch.stack([s["true_move"][:, 0] / 50 - 1 for s in states])
+    stretch = torch.stack([s["true_leg"][:, 0] / 50 - 1 for s in states])
     torch.testing.assert_close(stretch.std(1), torch.full((3,), 0.02), rtol=0.05, atol=0)
     assert torch.corrcoef(stretch).triu(1).abs().max() < 4.5 / math.sqrt(3000)
     assert all(s["heading"].eq(0).all() for s in states)
@@ -89,11 +89,11 @@ def test_each_episode_has_eddies_of_its_own() -> None:
     assert len(waves.flatten(0, 1).unique(dim=0)) == 6 * EDDIES
     after = env.step(second.clone().set("action", torch.tensor([[50.0, 0.0]]).expand(3, -1)))["next"]
     velocity = 2.0 * eddy_velocity(second["position"], waves[3:].double(), errors[3:, 3 : 3 + EDDIES].double())
-    torch.testing.assert_close(after["displacement"], 2.5 * velocity, atol=1e-3, rtol=0)
+    torch.testing.assert_close(after["leg_error"], 2.5 * velocity, atol=1e-3, rtol=0)
     assert MotionError(log_scale=0.1).size == 3 + EDDIES
 
 
-def test_the_environment_must_allow_the_farthest_move() -> None:
+def test_the_environment_must_allow_the_farthest_leg() -> None:
     def errors() -> MotionError:
         return MotionError(log_noise=0.01, current_km_h=3.0, speed_km_h=30.0)
 
@@ -126,16 +126,14 @@ def test_an_error_of_two_degrees_turns_the_heading_and_the_declination() -> None
 
 
 def test_declination_is_wrapped() -> None:
-    state = TensorDict(
-        heading=torch.tensor([[-3.12]]), field=torch.tensor([[-179.0, 0.0, 1.0]]), move=torch.zeros(1, 2)
-    )
+    state = TensorDict(heading=torch.tensor([[-3.12]]), field=torch.tensor([[-179.0, 0.0, 1.0]]), leg=torch.zeros(1, 2))
     after = NorthReferenceError(3.0, fixed=True)._reset(TensorDict(batch_size=[1]), state.auto_batch_size_(1))
     torch.testing.assert_close(after["field"][0, 0], torch.tensor(178.0))
     torch.testing.assert_close(after["heading"][0, 0], torch.tensor(2 * math.pi - 3.12 - math.radians(3)))
 
 
 def test_error_grows_with_the_secant_of_the_latitude() -> None:
-    keys = ("heading", "field", "move", "position")
+    keys = ("heading", "field", "leg", "position")
     error = NorthReferenceError(0.5, fixed=True, in_keys=keys)
     for state in flown(TransformedEnv(nav(3), error), actions(3, 3)):
         latitude = state["position"][:, 0].deg2rad()
@@ -170,11 +168,11 @@ def test_references_on_the_market(name: str) -> None:
 # Magnetic north
 
 
-def test_a_move_starts_at_the_heading_from_magnetic_north() -> None:
-    """And the next heading is that which was chosen: it does not tell how D changed along the move."""
+def test_a_leg_starts_at_the_heading_from_magnetic_north() -> None:
+    """And the next heading is that which was chosen: it does not tell how D changed along the leg."""
     states = flown(TransformedEnv(nav(3), MagneticNorth()), actions(4, 3))
     for before, state in itertools.pairwise(states):
-        chosen = before["heading"] + state["move"][:, 1:]
+        chosen = before["heading"] + state["leg"][:, 1:]
         around = torch.remainder(state["heading"] - chosen + 1, 2 * math.pi) - 1
         torch.testing.assert_close(around, torch.zeros(3, 1), atol=1e-5, rtol=0)
         course = geodesic(*before["position"].unbind(-1), *state["position"].unbind(-1))[1]

@@ -32,14 +32,14 @@ def test_constant_errors_by_hand() -> None:
         torch.testing.assert_close(state["sensor_std"][0], torch.tensor([0.0, 0.5 / math.sqrt(12), 0.0]))
 
 
-def test_drift_is_stationary_and_forgets_with_the_way() -> None:
+def test_drift_is_stationary_and_forgets_with_the_path() -> None:
     count = 4000
     env = TransformedEnv(nav(count), SensorErrors((0.0,) * 3, drift=(0.1, 0.2, 30.0), drift_length=40.0))
     step = torch.tensor([[[20.0, 0.1]], [[0.0, 0.0]], [[20.0, 1.0]]]).expand(-1, count, -1)
     named = [env.transform.named(state["sensor_error"]) for state in flown(env, step)]
     drift = torch.stack([errors["drift"] for errors in named]) / torch.tensor([0.1, 0.2, 30.0])
     torch.testing.assert_close(drift.std(1), torch.ones(4, 3), atol=0.05, rtol=0)
-    assert torch.equal(drift[1], drift[2])  # no way, no change
+    assert torch.equal(drift[1], drift[2])  # no path, no change
     for later, correlation in ((1, math.exp(-0.5)), (3, math.exp(-1))):
         found = torch.stack([torch.corrcoef(drift[[0, later], :, k])[0, 1] for k in range(3)])
         torch.testing.assert_close(found, torch.full((3,), correlation), atol=0.05, rtol=0)
@@ -59,7 +59,7 @@ def test_an_outage_repeats_the_last_reading() -> None:
         )
 
 
-def test_drift_by_steps_without_a_move() -> None:
+def test_drift_by_steps_without_a_leg() -> None:
     errors = SensorErrors(drift=(1.0, 1.0, 1.0), drift_length=2.0, in_keys=["field"])
     before, after = flown(TransformedEnv(nav(4000), errors), torch.zeros(1, 4000, 2))
     pair = torch.stack([errors.named(state["sensor_error"])["drift"][:, 0] for state in (before, after)])
@@ -221,13 +221,13 @@ def test_random_noise_has_the_level_of_its_episode() -> None:
 
 
 def test_the_bias_is_partly_constant_and_as_large_as_told() -> None:
-    """Their correlation along the way is that of a half that is constant and a half that drifts."""
+    """Their correlation along the path is that of a half that is constant and a half that drifts."""
     env = under(SensorErrors(levels=noisy(30.0), seed=3), num_envs=4000)
-    keys = ("field", "true_field", "bias_std", "sensor_std", "move")
+    keys = ("field", "true_field", "bias_std", "sensor_std", "leg")
     td = torch.stack([state.select(*keys) for state in flown(env, actions(9, 4000))])
     assert (td["bias_std"] == 30).all()
     silent = (td["sensor_std"][0] == 0).all(-1)
-    error, moved = (td["field"] - td["true_field"])[:, silent, 2] / 30, td["move"][:, silent, 0].cumsum(0)
+    error, moved = (td["field"] - td["true_field"])[:, silent, 2] / 30, td["leg"][:, silent, 0].cumsum(0)
     assert error.std() == pytest.approx(1.0, rel=0.06)
     expected = 0.5 + 0.5 * torch.exp(-moved / DRIFT_KM)  # shares are uniform
     torch.testing.assert_close((error * error[0]).mean(-1), expected.mean(-1), rtol=0, atol=0.15)

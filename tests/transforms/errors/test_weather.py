@@ -89,7 +89,7 @@ def test_the_variation_of_the_minute_is_added_to_the_vector() -> None:
         variation = field_vector(measured["field"].double()) - field_vector(true["field"].double())
         expected = minute.unsqueeze(-1) * torch.tensor([1.0, 2.0, 3.0])
         torch.testing.assert_close(variation, expected.double(), atol=0.03, rtol=0)
-        for key in ("position", "objective", "success", "target_field", "move", "heading", "done"):
+        for key in ("position", "objective", "success", "target_field", "leg", "heading", "done"):
             assert torch.equal(measured[key], true[key]), key
         assert torch.equal(measured["true_field"], true["field"])
 
@@ -97,7 +97,7 @@ def test_the_variation_of_the_minute_is_added_to_the_vector() -> None:
 def test_elements_by_hand() -> None:
     """400 nT eastward on a field of 300 nT northward: D = atan(4/3), I = atan(500/500), B_H = 500."""
     record = WeatherRecord(torch.tensor([[0.0, 0.0, 0.0], [0.0, 400.0, 500.0]]))
-    td = TensorDict(field=torch.tensor([0.0, 0.0, 300.0]), move=torch.zeros(2))
+    td = TensorDict(field=torch.tensor([0.0, 0.0, 300.0]), leg=torch.zeros(2))
     weather = MagneticWeather(record, speed_km_h=1.0, span_h=0.0)
     before = weather(td.clone()).set("weather_clock", torch.tensor([1.0, 0.0], dtype=torch.float64))
     measured = weather(before.set("next", td))["next"]
@@ -117,7 +117,7 @@ def test_the_clock_stops_at_the_span() -> None:
 def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
     """From the quiet day on, a storm comes after two days: 12 nT over 500 km as a ship, 32 nT over 1800 km."""
     stated = []
-    for longest, own in ((300.0, {}), (500.0, {}), (1800.0, {}), (1800.0, {"way_km": 500.0})):
+    for longest, own in ((300.0, {}), (500.0, {}), (1800.0, {}), (1800.0, {"trip_km": 500.0})):
         ship = Conditions("ship", SHIP, {"weather": {"record": "quiet", "span_h": 200.0, **own}})
         scenario = Scenario(distance_range_km=(100.0, longest), tasks=named_tasks("figure-4-1"))
         stated.append(Flight(scenario, errors=ship).sensor_std.drift[2])
@@ -130,8 +130,8 @@ def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
 MISTAKES: dict[str, Callable[[], object]] = {
     r"24.1 h .*'college'.*23.9 h": lambda: MagneticWeather("college", speed_km_h=SHIP, span_h=24.1),
     "needs span_h": lambda: MagneticWeather(speed_km_h=SHIP)(nav().reset()),
-    "way_km must be .* above 0, got 0": lambda: MagneticWeather(speed_km_h=SHIP, way_km=0),
-    # 50 moves of 50 km at 6.1 km/h take 411 h, and 13 days follow the disturbed one
+    "trip_km must be .* above 0, got 0": lambda: MagneticWeather(speed_km_h=SHIP, trip_km=0),
+    # 50 legs of 50 km at 6.1 km/h take 411 h, and 13 days follow the disturbed one
     r"410.6\d* h .*'disturbed'.* 237.1 h": lambda: ship(speed_km_h=6.1).specs,
     "'boulder-2014', 'college', got 'storm'": lambda: weather_record("storm"),
     r"\(3,\)": lambda: WeatherRecord(torch.zeros(3)),

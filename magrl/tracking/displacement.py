@@ -14,15 +14,15 @@ _CANDIDATES = 16  # points among which that with most mass around it is chosen
 ELSEWHERE_KM = 10_000.0  # distance of a destination that is not within reach, half of the farthest
 
 
-class Way(NamedTuple):
+class Displacement(NamedTuple):
     """Displacement ``(..., 2)`` northward and eastward [km] and its covariance ``(..., 2, 2)`` [km^2].
 
     Example:
-        >>> Way(torch.zeros(2), torch.eye(2)).displacement
+        >>> Displacement(torch.zeros(2), torch.eye(2)).mean
         tensor([0., 0.])
     """
 
-    displacement: Tensor
+    mean: Tensor
     covariance: Tensor
 
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -32,7 +32,7 @@ class Way(NamedTuple):
         Where two elements do not determine a place, the displacement is known across a line, and not along it.
 
         Example:
-            >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).axes()
+            >>> Displacement(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).axes()
             (tensor(30.), tensor(10.), tensor(90.))
         """
         (nn, ne), (_, ee) = (row.unbind(-1) for row in self.covariance.unbind(-2))
@@ -44,7 +44,7 @@ class Way(NamedTuple):
         """Return the axes of one displacement as text.
 
         Example:
-            >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).ellipse()
+            >>> Displacement(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).ellipse()
             '± 10 km across, ± 30 km along 090°'
         """
         along, across, bearing = (axis.item() for axis in self.axes())
@@ -57,7 +57,7 @@ class DestinationPosterior(NamedTuple):
 
     Example:
         >>> posterior = DestinationPosterior(torch.tensor([[0.0, 10.0], [0.0, 30.0]]), torch.tensor([0.25, 0.75]))
-        >>> posterior.way().displacement, posterior.within(25.0)
+        >>> posterior.displacement().mean, posterior.within(25.0)
         (tensor([ 0., 25.]), tensor(0.2500))
     """
 
@@ -65,13 +65,13 @@ class DestinationPosterior(NamedTuple):
     weights: Tensor
     reached: Tensor | float = 1.0
 
-    def way(self) -> Way:
+    def displacement(self) -> Displacement:
         """Return the mean and the covariance; with what is not within reach, at thousands of kilometers, around it."""
         mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
         apart = self.points - mean.unsqueeze(-2)
         covariance = (apart * self.weights.unsqueeze(-1)).mT @ apart
         reached = torch.as_tensor(self.reached).to(covariance)[..., None, None]
-        return Way(mean, reached * covariance + (1 - reached) * ELSEWHERE_KM**2 * torch.eye(2).to(covariance))
+        return Displacement(mean, reached * covariance + (1 - reached) * ELSEWHERE_KM**2 * torch.eye(2).to(covariance))
 
     def aim(self, radius_km: float) -> Tensor:
         """Return the displacement to aim at ``(..., 2)`` [km]: the mean, or, where that is within a radius of the
@@ -92,7 +92,7 @@ class DestinationPosterior(NamedTuple):
         center = centers.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
         return torch.where(mean.norm(dim=-1, keepdim=True) > radius_km, mean, center)
 
-    def mean_distance(self, moves: Tensor) -> Tensor:
+    def mean_distance(self, legs: Tensor) -> Tensor:
         """Return the mean distances ``(..., K)`` [km] of the place after legs ``(..., K, 2)`` [km], as float32.
 
         Example:
@@ -101,14 +101,14 @@ class DestinationPosterior(NamedTuple):
             tensor([35., 25.])
         """
         weights = self.weights.float().unsqueeze(-1)
-        parts = [(self._squares(some).sqrt_() @ weights).squeeze(-1) for some in moves.split(_AT_ONCE, -2)]
+        parts = [(self._squares(some).sqrt_() @ weights).squeeze(-1) for some in legs.split(_AT_ONCE, -2)]
         return torch.cat(parts, -1)
 
-    def _squares(self, moves: Tensor) -> Tensor:
+    def _squares(self, legs: Tensor) -> Tensor:
         """Return the squared distances ``(..., K, M)`` of the points after legs, as one matrix product [km^2]."""
-        points, moves = self.points.float(), moves.float()
+        points, legs = self.points.float(), legs.float()
         # 0.01 km^2 is for the rounding
-        left = torch.cat((moves, moves.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(moves[..., :1])), -1)
+        left = torch.cat((legs, legs.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(legs[..., :1])), -1)
         right = torch.cat((-2 * points, torch.ones_like(points[..., :1]), points.square().sum(-1, keepdim=True)), -1)
         return left @ right.mT
 
