@@ -100,7 +100,7 @@ def learning() -> Figures:
         for name, pattern in declared(FILE)["learning"].items()
         for number, run in enumerate(matching(pattern))
     ]
-    data = concat(runs)[["navigator", "run", "frames", "eval_return", "eval_success_rate"]].round(2)
+    data = concat(runs)[["navigator", "run", "frames", "eval_return", "eval_success_rate"]].dropna().round(2)
     return {"results/learning": data} | {file: curves(data, *shown) for file, shown in CURVES.items()}
 
 

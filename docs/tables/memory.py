@@ -1,11 +1,10 @@
 """What a memory has learned: agents of ppo_memory.py and filters, on the task of a training and under other errors.
 
-    python docs/tables/sweep.py --algorithms ppo_memory    # the agents
-    python docs/tables/memory.py                           # five minutes
+    python docs/tables/memory.py    # five minutes
 
-Cells are the SPL [%] of the 200 episodes of a named task (:func:`magrl.evaluation.score`), of several agents the mean
-and the range. *Storm* is in the record of its weather, and in four others; *Readings* also has the errors of a ship and
-of low-cost sensors. No agent was trained with these.
+Cells are the SPL [%] of the 200 episodes of a named task (:func:`magrl.evaluation.score`). *Storm* is in the record of
+its weather, and in four others; *Readings* also has the errors of a ship and of low-cost sensors. No agent was trained
+with these.
 """
 
 from __future__ import annotations
@@ -24,24 +23,22 @@ from magrl.evaluation.tables import markdown_table
 from magrl.field import WeatherRecord, weather_record
 from magrl.files import write_text
 from magrl.navigators.memory import LIMITS
-from magrl.training import UsageError, command
+from magrl.training import command
 from magrl.transforms import CONDITIONS
 
-import torch
 import tyro
 from torch import Tensor
 
-TRAINED = {"storm": "memory, trained on storm", "readings": "memory, trained on readings"}
-OTHERS = {name: BARS[name] for name in ("kalman", "anywhere", "secant")}
+AGENTS = {"memory": "memory (pretrained), trained on storm"}
+AGENTS |= {"docs/results/agents/readings-ppo_memory.safetensors": "memory, trained on readings"}
+AGENTS |= {name: BARS[name] for name in ("kalman", "anywhere", "secant")}
 TOLD = BARS["told"]
 
 
 @dataclass(frozen=True)
 class Config:
-    """Agents and results."""
+    """Episodes and result."""
 
-    runs: Path = Path("runs/sweep")
-    """Folder of the sweep."""
     episodes: int = 200
     """Episodes of a cell."""
     out: Path = Path("docs/results/memory.md")
@@ -85,35 +82,17 @@ def told(options: dict[str, Any]) -> dict[str, Any]:
     return {"transforms": storm_errors(options["transforms"][0].record, stated=True)}
 
 
-def cell(agents: list[str], task: str, options: dict[str, Any], episodes: int) -> str:
-    """Return the mean SPL of agents, and their range."""
-    found = torch.tensor([score(agent, task, episodes=episodes, **options)["SPL"] for agent in agents])
-    return f"{found.mean():.1f}" + f" ({found.min():.1f}–{found.max():.1f})" * (len(agents) > 1)
-
-
-def trained(runs: Path, task: str) -> list[str]:
-    """Return the agents of the sweep on a task."""
-    return [str(path) for path in sorted(runs.glob(f"{task}-ppo_memory-seed*/policy.safetensors"))]
-
-
 def main(config: Config) -> None:
     """Fly all agents and write the table."""
-    agents = {label: trained(config.runs, task) for task, label in TRAINED.items()}
-    if not any(agents.values()):
-        raise UsageError(f"{config.runs} has no agents: python docs/tables/sweep.py --algorithms ppo_memory")
-    agents |= {label: [name] for name, label in OTHERS.items()}
-    tasks = columns()
-    cells = {
-        label: [cell(names, *column, config.episodes) for column in tasks.values()]
-        for label, names in agents.items()
-        if names
-    }
-    cells[TOLD] = [
-        cell(["kalman"], task, told(options), config.episodes) if task == "storm" else "—"
+    tasks, rows = columns(), []
+    for agent, label in AGENTS.items():
+        cells = [score(agent, task, episodes=config.episodes, **options)["SPL"] for task, options in tasks.values()]
+        rows.append([label, *(f"{spl:.1f}" for spl in cells)])
+    knows = [
+        f"{score('kalman', task, episodes=config.episodes, **told(options))['SPL']:.1f}" if task == "storm" else "—"
         for task, options in tasks.values()
     ]
-    rows = [[label, str(len(agents.get(label, [TOLD]))), *row] for label, row in cells.items()]
-    write_text(config.out, markdown_table(["agent", "seeds", *tasks], rows))
+    write_text(config.out, markdown_table(["agent", *tasks], [*rows, [TOLD, *knows]]))
 
 
 if __name__ == "__main__":

@@ -48,8 +48,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from bars import flown
 from flights import Flights, believed_places
 
-SHOWN, WITHIN_KM = 20, 25.0
-"""Task of the animation, chosen because a coast is in sight, and the radius of arrival."""
+SHOWN, WITHIN_KM = 134, 25.0
+"""Task of the animation, chosen in the open sea with a coast in sight, and the radius of arrival."""
 FIELD = IGRF("2025-01-01")
 GRAY, BLUE, VERMILION = "#707070", "#0072B2", "#D55E00"
 KM_PER_DEG, ROOM_KM = 111.2, 30.0
