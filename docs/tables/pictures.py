@@ -48,7 +48,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from bars import flown
 from flights import Flights, believed_places
 
-SHOWN, WITHIN_KM = 134, 25.0
+SHOWN, WITHIN_KM = 212, 25.0
 """Task of the animation, chosen in the open sea with a coast in sight, and the radius of arrival."""
 FIELD = IGRF("2025-01-01")
 GRAY, BLUE, VERMILION = "#707070", "#0072B2", "#D55E00"
@@ -139,7 +139,7 @@ class Animation:
         self.texts[0].set_ha("right")
 
     def image(self, time: float, verdict: str = "") -> Image.Image:
-        """Return the map at a time in steps, with a text in its middle."""
+        """Return the map at a time in steps, with a text above the paths."""
         here, there = (trip.at(time) for trip in self.trips)
         for line, places in zip(self.lines, (here.believed, here.true, there.true), strict=True):
             line.set_data(*places.T.flip(0))
@@ -153,7 +153,7 @@ class Animation:
             text.set_text(content)
         if verdict:
             box = {"facecolor": "white", "edgecolor": BLUE, "lw": 2, "pad": 16}
-            self.figure.text(0.42, 0.6, verdict, fontsize=27, ha="center", va="center", linespacing=1.6, bbox=box)
+            self.figure.text(0.56, 0.8, verdict, fontsize=27, ha="center", va="center", linespacing=1.6, bbox=box)
         return image_of(self.figure)
 
     def frames(self, verdict: str) -> Iterator[Image.Image]:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import figures
 import flights
@@ -220,6 +221,14 @@ def test_each_error_has_a_line_for_each_navigator(monkeypatch) -> None:
     assert [[len(line.get_xdata()) for line in some] for some in lines] == [[size] * 4 for size in sizes]
     assert lines[0][0].get_ydata()[0] == 90
     assert [text.get_text() for text in last.get_legend().texts][:2] == ["anywhere", "Kalman"]
+
+
+def test_the_mean_of_a_cell_has_an_interval_clustered_by_region() -> None:
+    flown = SimpleNamespace(episodes=lambda *_: [{"spl": torch.tensor([1.0, 0.8, 0.9])}])
+    flown.scenario = SimpleNamespace(tasks=SimpleNamespace(region=torch.tensor([0, 1, 1])))
+    mean, half = figures.mean_spl(flown, "secant", None)
+    assert mean == pytest.approx(90)
+    assert half == pytest.approx(1.96 * 20 / 3)
 
 
 def test_the_reliability_diagram_has_a_panel_for_noise_and_one_for_vehicles(monkeypatch) -> None:
