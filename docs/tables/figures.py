@@ -117,7 +117,7 @@ def curves(data: DataFrame, column: str, label: str) -> Figure:
 
 def look(navigator: str) -> dict[str, Any]:
     """Return color, marker and label of a navigator in panels."""
-    label = KINDS[navigator].description.partition(" (")[0]
+    label = KINDS[navigator].description.partition(" (")[0] + ", an oracle" * getattr(KINDS[navigator], "oracle", False)
     color = plots.NAVIGATOR_COLORS[navigator]
     return {"color": color, "marker": MARKERS[navigator], "label": label, "ms": 4, "lw": 1.3, "capsize": 2}
 
