@@ -12,8 +12,10 @@ TABLES = ROOT / "docs" / "tables"
 
 
 def load(name: str) -> ModuleType:
-    """Return a script, such as ``docs/tables/grid``, as a module."""
+    """Return a script, such as ``docs/tables/grid``, as a module; one that was imported is the same for all."""
     spec = importlib.util.spec_from_file_location(Path(name).name, ROOT / f"{name}.py")
+    if getattr(sys.modules.get(spec.name), "__file__", None) == spec.origin:
+        return sys.modules[spec.name]
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
