@@ -110,7 +110,9 @@ def navigation_env(
     for transform in _observation(env, observation):
         env.append_transform(transform)
     if scale_actions:
-        env.append_transform(MinMaxNorm(in_keys_inv=["action"]))
+        space, changed = base.action_spec.space, any("action" in step.in_keys_inv for step in env.transform)
+        bounds = {} if changed else {"action": (space.low[0], space.high[0])}  # else TorchRL computes all specs for it
+        env.append_transform(MinMaxNorm(in_keys_inv=["action"], bounds=bounds))
     return env
 
 

@@ -323,7 +323,7 @@ def test_navigators_fly_running_episodes_alone(name: str) -> None:
     """As they do among those that have ended, with their memory and the errors of each vehicle."""
     told = {"errors": (0.05, 0.05, 5.0), "seed": 1, "max_steps": 30}
     told |= {"arrival": "declared", "model": "IGRF-13", "start_km": 5.0} if name == "dead_reckoning" else {}
-    flight = Flight(first_tasks(choose_tasks(None, "paper-100"), 12), **told)
+    flight = Flight(first_tasks(choose_tasks(None, "paper-100"), 6), **told)
     navigator, seen = flight.navigator(name), []
     hook = navigator.register_forward_pre_hook(lambda _, args: seen.append(len(args[0])))
     found = evaluation_rollout(flight.env_of(navigator), navigator)
@@ -331,7 +331,7 @@ def test_navigators_fly_running_episodes_alone(name: str) -> None:
     env = flight.env_of(navigator)
     wanted = evaluation_rollout(env, lambda state: navigator(state))  # others may expect all vehicles
     done = found["next", "done"].squeeze(-1)
-    assert seen == [12, *(~done).sum(0)[:-1].tolist()]
+    assert seen == [6, *(~done).sum(0)[:-1].tolist()]
     assert seen[-1] < seen[0]
     assert done[:, -1].all()
     for key, values in episode_measures(wanted).items():

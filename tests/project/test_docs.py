@@ -325,7 +325,8 @@ def test_no_code_lists_the_named_tasks_again() -> None:
     """Three of them in one literal are a list."""
     found = []
     for path in (*ROOT.glob("magrl/**/*.py"), *ROOT.glob("recipes/*.py"), *ROOT.glob("docs/tables/*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8").lower()
+        for node in ast.walk(ast.parse(text)) if sum(f'"{name}' in text for name in NAMED_TASKS) > 2 else ():
             parts = [*getattr(node, "keys", []), *getattr(node, "elts", [])]
             names = {str(part.value).split("-")[0].lower() for part in parts if isinstance(part, ast.Constant)}
             found += [f"{path.name}: {ast.unparse(node)}"] * (len(names & {*NAMED_TASKS}) > 2)
