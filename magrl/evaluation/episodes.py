@@ -68,7 +68,8 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
     if isinstance(policy, Navigator):
         policy.check_fits(env)
     env = policy_env(env, policy)
-    own = isinstance(policy, Navigator) and not isinstance(policy, ArrayPolicy)
+    base = getattr(env, "base_env", env)
+    alone = isinstance(policy, Navigator) and not isinstance(policy, ArrayPolicy) and base.render_mode is None
     failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
     steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _evaluating(policy):
@@ -82,7 +83,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
             state, flies = step_mdp(step), ~step["next", "done"].squeeze(-1)
             step = step.exclude(*LARGE_KEYS)
             steps.append(step if whole else _completed(steps[-1], rows, step))
-            if own or not flies.any():  # others may expect all vehicles
+            if alone or not flies.any():  # functions and pictures may expect all vehicles
                 state, rows = state[flies], rows[flies]
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():

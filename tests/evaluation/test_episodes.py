@@ -352,6 +352,13 @@ def test_a_function_sees_all_vehicles_at_each_step() -> None:
     assert set(seen) == {4}
 
 
+def test_pictures_of_an_evaluation_have_all_vehicles() -> None:
+    env = GeomagneticNavEnv(num_envs=6, seed=0, render_mode="rgb_array")
+    rollout = evaluation_rollout(env, Secant.for_env(env))
+    assert rollout["next", "done"][:, :-1].any()
+    assert torch.equal(env.track(5)[-1], rollout["next", "position"][5, -1])
+
+
 def test_an_action_of_another_shape_is_named() -> None:
     with pytest.raises(ValueError, match=r"the agent's action must be \(2, 2\), got \(2, 3\)"):
         evaluation_rollout(navigation_env(2, seed=0), lambda state: state.set("action", torch.zeros(2, 3)))
