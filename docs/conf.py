@@ -89,9 +89,24 @@ def link_names(app: Any, doctree: nodes.document, page: str) -> None:
             code.replace_self(make_refnode(app.builder, page, found[0].docname, found[0].node_id, code.deepcopy()))
 
 
+def list_names(app: Any, doctree: nodes.document, page: str) -> None:
+    """List the classes and functions of a page of the API below its title."""
+    entries = app.env.domains.python_domain.objects
+    kinds = {"class", "function", "exception"}
+    names = [name for name, entry in entries.items() if (entry.docname, entry.aliased) == (page, False)]
+    names = sorted((name for name in names if entries[name].objtype in kinds), key=lambda name: name.rpartition(".")[2])
+    listed = nodes.paragraph()
+    for name in names if page.startswith("api/") else ():
+        label = nodes.literal(text=name.rpartition(".")[2])
+        listed += [make_refnode(app.builder, page, page, entries[name].node_id, label), nodes.Text(" ")]
+    if listed.children:
+        doctree.next_node(nodes.section).insert(1, listed)
+
+
 def setup(app: Any) -> None:
     """Connect the hooks of this project."""
     app.connect("source-read", prepare)
     app.connect("autodoc-process-docstring", describe, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", show_arguments)
     app.connect("doctree-resolved", link_names)
+    app.connect("doctree-resolved", list_names)
