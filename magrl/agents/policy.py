@@ -154,6 +154,8 @@ class FieldPolicy(Navigator):
         Raises:
             ValueError: for another network.
         """
+        if isinstance(self.actor, OnnxNetwork):
+            return
         actors = self.config.make_actor("meta"), self.actor  # the first one draws no random weights
         made, given = (
             {name: values.shape for name, values in actor.state_dict().items() if isinstance(values, Tensor)}
@@ -162,7 +164,7 @@ class FieldPolicy(Navigator):
         if made != given:
             other = ", ".join(sorted({*made} ^ {*given}) or sorted(given))[:200]
             raise ValueError(
-                f"the actor is not PolicyConfig.make_actor(), from which a file makes it again ({other}): "
+                f"the actor has other weights than PolicyConfig.make_actor(), which a file makes again ({other}): "
                 "write save_policy('policy.onnx', actor, view) for a network of your own"
             )
 

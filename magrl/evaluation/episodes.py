@@ -17,7 +17,18 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    EnvBase,
+    RenameTransform,
+    RewardScaling,
+    RewardSum,
+    StepCounter,
+    TensorDictPrimer,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from magrl.checks import check_number, check_tensor, check_type
@@ -31,6 +42,8 @@ from magrl.navigators.base import MEMORY
 _LARGE = (("track", "state"), ("track", "posterior"), (MEMORY,))
 LARGE_KEYS = [(*root, *key) for root in ((), ("next",)) for key in _LARGE]
 """Keys that rollouts leave out."""
+BY_ROW = (CatTensors, Compose, RenameTransform, RewardScaling, RewardSum, StepCounter, TensorDictPrimer)
+"""Transforms of TorchRL that step some rows of a batch as they step them all; others may be of its size."""
 
 
 def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bool = False) -> TensorDict:
@@ -48,9 +61,9 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
-        What follows the end of an episode does not count; a navigator flies the running episodes alone. Memories, and
-        the state and the posterior of a :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are
-        left out.
+        What follows the end of an episode does not count; a navigator flies the running episodes alone, if all
+        transforms are of magrl or among :data:`BY_ROW`. Memories, and the state and the posterior of a
+        :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are left out.
 
     Raises:
         TypeError: for another environment, or a policy that is not callable.
@@ -68,8 +81,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
     if isinstance(policy, Navigator):
         policy.check_fits(env)
     env = policy_env(env, policy)
-    base = getattr(env, "base_env", env)
-    alone = isinstance(policy, Navigator) and not isinstance(policy, ArrayPolicy) and base.render_mode is None
+    alone = isinstance(policy, Navigator) and not isinstance(policy, ArrayPolicy) and _steps_rows(env)
     failed, still = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device), _still(env)
     steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _evaluating(policy):
@@ -83,7 +95,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
             state, flies = step_mdp(step), ~step["next", "done"].squeeze(-1)
             step = step.exclude(*LARGE_KEYS)
             steps.append(step if whole else _completed(steps[-1], rows, step))
-            if alone or not flies.any():  # functions and pictures may expect all vehicles
+            if alone or not flies.any():  # others may expect all vehicles
                 state, rows = state[flies], rows[flies]
     rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():
@@ -101,6 +113,15 @@ def _acted(
         raise ValueError(f"the agent's action must be {tuple(stop.shape)}, got {tuple(action.shape)}")
     failed[rows] |= ~torch.isfinite(action.float()).all(-1, keepdim=True)
     return state.set("action", torch.where(failed[rows], stop, action))
+
+
+def _steps_rows(env: EnvBase) -> bool:
+    """Return whether an environment steps some of its vehicles as it steps them among all, and keeps no tracks."""
+    if not isinstance(env, TransformedEnv):
+        return env.render_mode is None
+    parts = [part for part in env.transform.modules() if isinstance(part, Transform)]
+    own = all(isinstance(part, BY_ROW) or type(part).__module__.startswith("magrl.") for part in parts)
+    return own and _steps_rows(env.base_env)
 
 
 def _following(env: EnvBase, state: TensorDictBase) -> TensorDictBase:

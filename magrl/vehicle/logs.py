@@ -60,12 +60,12 @@ NAMED = {key: key for key in (*NAMES, "heading", "distance", "speed", *_PLACE)}
 """Columns of a file by what they are."""
 
 
-def read_readings(path: Path | str, names: Mapping[str, str] = NAMED, time: str | None = "time") -> DataFrame:
+def read_readings(path: Path | str, names: Mapping[str, str] | None = None, time: str = "time") -> DataFrame:
     """Return the readings of a CSV file with a header, one for each leg.
 
     Args:
         path: the file.
-        names: its columns, if they have other names, by ``D``, ``I``, ``B_H``, ``heading``, and ``distance``, or
+        names: its columns that have other names, by ``D``, ``I``, ``B_H``, ``heading``, and ``distance``, or
             ``speed`` beside a time; and optionally ``latitude`` and ``longitude``, and ``altitude``, which the file may
             lack. A unit that ends a name counts, such as of ``H_uT``, and a name is also found with one, such as
             ``altitude_m``; without one, it is nT, deg, km or m/s.
@@ -86,7 +86,9 @@ def read_readings(path: Path | str, names: Mapping[str, str] = NAMED, time: str 
     """
     try:
         raw = read_table(read_text(Path(path)), dtype=str)
-        log = DataFrame({"row": np.arange(len(raw)) + 1} | _columns(raw, names))  # the header is not counted
+        log = DataFrame(
+            {"row": np.arange(len(raw)) + 1} | _columns(raw, {**NAMED, **(names or {})})
+        )  # the header is not counted
         if len(log) < 2:
             raise ValueError("it must hold at least two rows")
         log.attrs = {"notes": [], "date": None}

@@ -13,7 +13,7 @@ from support.episodes import episode, point
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import CatFrames, InitTracker, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
@@ -357,6 +357,14 @@ def test_pictures_of_an_evaluation_have_all_vehicles() -> None:
     rollout = evaluation_rollout(env, Secant.for_env(env))
     assert rollout["next", "done"][:, :-1].any()
     assert torch.equal(env.track(5)[-1], rollout["next", "position"][5, -1])
+
+
+@pytest.mark.parametrize("transform", [InitTracker(), CatFrames(4, dim=-1, in_keys=["field"], out_keys=["fields"])])
+def test_transforms_of_the_size_of_the_batch_keep_all_vehicles(transform: Transform) -> None:
+    env = TransformedEnv(GeomagneticNavEnv(num_envs=8, seed=3), transform.clone())
+    done = evaluation_rollout(env, Secant())["next", "done"]
+    assert done[:, :-1].any()
+    assert done.any(1).all()
 
 
 def test_an_action_of_another_shape_is_named() -> None:

@@ -36,11 +36,11 @@ def log() -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def test_a_file_with_the_names_of_readings_needs_no_others(tmp_path: Path) -> None:
+def test_only_columns_with_other_names_are_named(tmp_path: Path) -> None:
     """Nor distances, if it has times and speeds."""
     table = log().assign(time=1000.0 * log().index, speed=log()["distance"]).drop(columns="distance")
-    table.to_csv(tmp_path / "log.csv", index=False)
-    found = read_readings(tmp_path / "log.csv")
+    table.rename(columns={"D": "dec"}).to_csv(tmp_path / "log.csv", index=False)
+    found = read_readings(tmp_path / "log.csv", {"D": "dec"})
     pandas.testing.assert_frame_equal(found[["D", "heading", "latitude"]], log()[["D", "heading", "latitude"]])
     assert found["distance"].tolist() == log()["distance"].tolist()
 
