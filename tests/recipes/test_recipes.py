@@ -34,10 +34,10 @@ def names(module) -> str:
     return module.__name__
 
 
-def few_steps(monkeypatch, max_steps: int) -> None:
-    """Give *NoGo* another deadline."""
-    row = recipe.NAMED_TASKS["nogo"]
-    monkeypatch.setitem(recipe.NAMED_TASKS, "nogo", row._replace(options={"max_steps": max_steps}))
+def few_steps(monkeypatch, max_steps: int, task: str = "nogo") -> None:
+    """Give a task another deadline."""
+    row = recipe.NAMED_TASKS[task]
+    monkeypatch.setitem(recipe.NAMED_TASKS, task, row._replace(options={**row.options, "max_steps": max_steps}))
 
 
 def test_the_return_is_the_sum_of_its_terms() -> None:
@@ -124,8 +124,9 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_training_in_eddies(tmp_path: Path) -> None:
+def test_training_in_eddies(tmp_path: Path, monkeypatch) -> None:
     """Its policy gets its last legs from the map of any environment of one region, and acts as in training."""
+    few_steps(monkeypatch, 8, "eddies")
     options = {"total_frames": 64, "eval_every": 4, "eval_tasks": 2, "eval_tasks_small": 2}
     recipe.train(small(recipe, tmp_path / "run", task="eddies", **options))
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
