@@ -90,6 +90,10 @@ RECIPES: dict[str, tuple[str, ...]] = {
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 COLORS = dict(zip((*ALGORITHMS, *RECIPES), OKABE_ITO, strict=False))
 """Colors of algorithms."""
+STYLES = {"secant": ":", "kalman": "--", "anywhere": "-.", "memory": (0, (1, 4)), "geodesic": "-", "told": (0, (8, 2))}
+STYLES |= {"around": (0, (5, 5)), "sighted": (0, (8, 2)), "detour": "-", "parallel": (0, (1, 4))}
+STYLES |= {"offset": (0, (5, 5)), "estimated": (0, (8, 2)), "mapped": (0, (3, 1, 1, 1, 1, 1))}
+"""Lines of references, each with one style in all panels."""
 
 
 @dataclass(frozen=True)
@@ -230,10 +234,10 @@ def figure(curves: DataFrame) -> Figure:
                 axes.plot(along.median()[kept], spl.median()[kept], color=COLORS[name], label=name)
                 band = along.median()[kept], spl.min()[kept], spl.max()[kept]
                 axes.fill_between(*band, color=COLORS[name], alpha=0.2, lw=0)
-        styles = ("-", "--", ":", "-.", (0, (1, 4)), (0, (5, 5)), (0, (8, 2)))
-        for name, style in zip(bars_of(task)[::-1], styles, strict=False):  # oracle first
+        for name in bars_of(task)[::-1]:  # oracle first
+            look = {"color": "gray", "ls": STYLES[name], "lw": 1, "label": BARS[name].partition(" (")[0]}
             for axes in both:
-                axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
+                axes.axhline(bar(task, name)["SPL"], **look)
         for axes, text in zip(both, ("steps", "CPU time [min]"), strict=True):
             axes.set(xscale="log", xlabel=text, ylim=(0, 102))
         both[0].set_ylabel("SPL [%]")
