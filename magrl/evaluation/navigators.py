@@ -192,9 +192,8 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
     for text in texts:
         for name, value in _trained_with(text).items():
             if name == "task":
-                notes += [f"{text} was trained for {value}, and flies other tasks here: score it there"] * (
-                    value != "box"
-                )
+                if value != "box":
+                    notes.append(f"{text} was trained for {value}, and flies other tasks here: score it there")
                 continue
             if _content(settings.setdefault(name, value)) == _content(value):
                 continue

@@ -1,19 +1,23 @@
 """The navigation environment behind the transforms of the recipes."""
 
+import math
 from collections.abc import Callable
 
+import pytest
 import td3_gradient_guided as recipe
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import CatTensors, Compose, TransformedEnv
+from torchrl.data import Bounded, Composite
+from torchrl.envs import CatTensors, Compose, Transform, TransformedEnv
 
 from magrl.envs import PAPER_REGION, GeomagneticNavEnv, Region, Scenario
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.navigators import Geodesic
-from magrl.transforms import GradientHeading, NorthReferenceError, SensorErrors
+from magrl.tracking import Rules
+from magrl.transforms import DeclareArrival, GradientHeading, NorthReferenceError, SensorErrors, TrackField
 
 
 def test_rewards() -> None:
@@ -79,3 +83,26 @@ def test_the_observation_of_the_recipes_is_added_to_own_ones() -> None:
     joined = CatTensors(["field", "leg"], "both", del_keys=False)
     state = navigation_env(2, transforms=[joined], seed=0).reset()
     assert (state["observation"].shape, state["both"].shape) == ((2, 13), (2, 5))
+
+
+class Twice(Transform):
+    """Half of each action, whose bounds are twice as wide; it names no keys."""
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", tensordict["action"] / 2)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        space = input_spec["full_action_spec", "action"].space
+        input_spec["full_action_spec", "action"] = Bounded(2 * space.low, 2 * space.high)
+        return input_spec
+
+
+def test_actions_are_scaled_to_the_bounds_that_transforms_leave() -> None:
+    rules = Rules(arrival="declared")
+    declared = navigation_env(2, seed=0, arrival="declared", transforms=[TrackField(rules), DeclareArrival(rules)])
+    for env in (navigation_env(2, seed=0), navigation_env(2, seed=0, transforms=[Twice()]), declared):
+        assert env.action_spec.shape == (2, 2)
+        assert (env.action_spec.space.low == -1).all()
+        assert (env.action_spec.space.high == 1).all()
+        state = env.reset().set("action", torch.tensor([[1.0, 0.5]]).expand(2, 2))
+        assert env.step(state)["next", "leg"][0].tolist() == pytest.approx([50, math.pi / 4])
