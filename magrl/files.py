@@ -1,33 +1,25 @@
-"""Safe files: tensors with atomic writes and a checksum, strict JSON, TOML, CSV. Reading executes no code of a file."""
+"""Safe files: tensors with atomic writes and a checksum, strict JSON, TOML. Reading executes no code of a file."""
 
 from __future__ import annotations
 
-import csv
 import errno
 import hashlib
-import io
 import json
 import math
 import os
 import tomllib
 import uuid
-import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import safetensors.torch
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
-from numpy.typing import NDArray
 from torch import Tensor
 
 from magrl.checks import UsageError, check_type, short
-
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
 
 MAX_FILE_BYTES = 10_000_000
 """Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
@@ -332,60 +324,6 @@ def read_text(path: Path) -> str:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"byte {error.start + 1} is not UTF-8: save the file as text in UTF-8") from error
-
-
-def read_table(text: str, **options: Any) -> DataFrame:
-    """Return the rows of a CSV table below its header; cells that lack at the end of a row are blank.
-
-    Args:
-        text: the table.
-        options: of :func:`pandas.read_csv` for the values.
-
-    Raises:
-        ValueError: for no row, two columns of one name, a row of more cells than the header, or a quoted text that is
-            not closed.
-
-    Example:
-        >>> read_table("time, x" + chr(10) + "0, 1")["x"].tolist()
-        [1]
-    """
-    import pandas  # where it is needed: it takes long to import
-
-    names = next(csv.reader(text.splitlines()[:1], skipinitialspace=True), [])
-    for name, count in Counter(map(str.strip, names)).items():
-        if name and count > 1:
-            raise ValueError(f"{count} columns have the name {short(name)}: keep one of them")
-    shape: dict[str, Any] = {"skipinitialspace": True, "index_col": False, "low_memory": False}
-    try:
-        with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
-            table = pandas.read_csv(io.StringIO(text), **shape, **options)
-    except (pandas.errors.ParserError, pandas.errors.ParserWarning) as error:
-        reason = f"a row has more cells than the columns {short(names, 300)}, as with decimal commas"
-        reason += ", or a quoted text is not closed"
-        raise ValueError(f"{reason}: {str(error).strip()}") from error
-    return table.rename(columns=str.strip)
-
-
-def numbers(column: Series) -> NDArray[np.float64]:
-    """Return the numbers of a column, NaN for blank cells.
-
-    Raises:
-        ValueError: for a cell that is no finite number, with its row and column.
-
-    Example:
-        >>> from pandas import Series
-        >>> numbers(Series(["1.5", None]))
-        array([1.5, nan])
-    """
-    import pandas
-
-    values = np.array(pandas.to_numeric(column, errors="coerce"), dtype=float)
-    bad = ~np.isfinite(values) & column.notna().to_numpy()
-    if bad.any():
-        row = int(bad.argmax())
-        cell = short(column.tolist()[row])
-        raise ValueError(f"row {column.index[row] + 1}, {column.name}: {cell} is not a number")
-    return values
 
 
 def read_document(path: Path) -> Any:

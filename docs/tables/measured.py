@@ -2,10 +2,10 @@
 
     python docs/tables/measured.py LOG.csv --out docs/results
 
-The log is one of recipes/replay_log.py with positions and their `altitude_km`; docs/results.md says which one the
-published table has. Each piece of the track is a flight from its first row to its last. The vehicle reads D, I, B_H of
-the log with white noise. The destination's elements, and those of a known start, are of the log, as from a survey, or
-of IGRF at its altitude.
+The log is a CSV file with the columns time, D, I, B_H, heading, distance, latitude, longitude and altitude_km;
+docs/results.md says which one the published table has. Each piece of the track is a flight from its first row to its
+last. The vehicle reads D, I, B_H of the log with white noise. The destination's elements, and those of a known start,
+are of the log, as from a survey, or of IGRF at its altitude.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking.belief import Belief, before, known, moved, read
 from magrl.tracking.destination import destination, log_density, posterior
 from magrl.training import command
-from magrl.vehicle.logs import read_readings
 from magrl.vehicle.mistakes import MODEL_STD
 
+import pandas as pd
 import torch
 import tyro
 from torch import Tensor
 
 RECIPE = "measured.py"
-NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude", "altitude")
+NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude", "altitude_km")
 SLOW = (0.05, 0.03, 15.0)
 """Standard deviations of what varies along the path, crust and currents, on D, I [deg], B_H [nT]: 15 nT; chosen."""
 RANGE_KM = {(300.0, 500.0): 400.0, (1200.0, 1800.0): 1000.0}
@@ -53,9 +53,9 @@ class Survey:
 
 def read_survey(path: Path, date: str | None = None) -> Survey:
     """Return the rows of a log, and IGRF at the altitude of each."""
-    log = read_readings(path, dict(zip(NAMES, NAMES, strict=True)), "time")
+    log = pd.read_csv(path)
     values = torch.tensor(log[list(NAMES)].to_numpy(float))
-    model = measured_elements(IGRF(date or log.attrs["date"])(*values[:, 5:].unbind(-1)))
+    model = measured_elements(IGRF(date or log["time"][0][:10])(*values[:, 5:].unbind(-1)))
     return Survey(values[:, :3], model, torch.deg2rad(values[:, 3]), values[:, 4], values[:, 5:7])
 
 

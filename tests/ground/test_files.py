@@ -25,7 +25,6 @@ from magrl.files import (
     check_writable,
     json_ready,
     load_tensors,
-    read_table,
     save_tensors,
     write_atomically,
     write_json,
@@ -204,12 +203,6 @@ def test_a_full_disk_names_the_file_and_leaves_it_as_it_was(name: str, tmp_path:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [each.read_text("utf-8") for each in tmp_path.iterdir()] == ["old"]
-
-
-def test_a_table_has_one_column_of_a_name() -> None:
-    with pytest.raises(ValueError, match="2 columns have the name 'a': keep one of them"):
-        read_table('a, b,"a"\n1,2,3')
-    assert read_table(",a,,a.1\n1,2,3,4")["a.1"].tolist() == [4]
 
 
 def test_check_writable_makes_folders_and_keeps_files(tmp_path: Path) -> None:

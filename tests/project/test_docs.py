@@ -19,7 +19,6 @@ from pathlib import Path
 import gymnasium
 import pytest
 import torch
-from support.px4 import write_px4_flight
 from support.recipes import load
 from torchrl.data import Composite
 
@@ -126,7 +125,6 @@ def reader(tmp_path_factory) -> Path:
     (folder / "runs" / "first").mkdir(parents=True)
     policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
     save_policy(folder / "runs" / "first" / "policy.safetensors", policy)
-    write_px4_flight(folder)
     (folder / "docs" / "examples").mkdir(parents=True)
     shutil.copy(ROOT / "docs/examples/log.csv", folder / "docs/examples")
     return folder

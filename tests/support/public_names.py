@@ -19,7 +19,6 @@ PACKAGES = (
 )
 """Packages whose functions and classes are public."""
 MODULES = ("checks", "files", "geodesy", "guidance", "sensor_std", "envs.gymnasium", "navigators.metaheuristics")
-MODULES += ("vehicle.logs",)
 """Modules whose functions and classes are public."""
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,11 @@ import torch
 
 from magrl.navigators import Geodesic
 from magrl.sensor_std import SensorStd
-from magrl.vehicle.logs import read_readings
 from magrl.vehicle.onboard import Onboard
 
 TARGET, HERE, NOISE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0), (0.02, 0.02, 2.0)
 BERGEN, THERE, DATE = (60.4, 5.3), (2.84, 73.05, 15003.0), {"date": "2026-06-30"}
 UPWARD = {"target_elements": (2.84, -73.05, 15003.0), "target_std": (0.5, 0.1, 20.0)}
-READINGS = "D,I,B_H,heading,distance"
-SPEEDS = "time,D,I,B_H,heading,speed"
 
 
 def start(target: Any = TARGET, here: Any = None, navigator: Any = "anywhere", **known: Any) -> Onboard:
@@ -38,15 +34,6 @@ def later(*values: Any) -> Any:
     vehicle = start()
     vehicle.step(*HERE, 290.0)
     return vehicle.step(*values)
-
-
-def written(*lines: str) -> Path:
-    Path("log.csv").write_text("\n".join(lines), encoding="utf-8")
-    return Path("log.csv")
-
-
-def readings(*lines: str, **columns: str) -> Any:
-    return read_readings(written(*lines), {name: name for name in [*READINGS.split(","), "speed"]} | columns, "time")
 
 
 ELEMENTS = {
@@ -109,35 +96,12 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (later, (*HERE, 290.0, 30000.0), {}, "distance 30000 km is longer than the longest leg of this vehicle, 50 km"),
     (later, (3.5, 73.0, 21000.0, 290.0, 40.0), {}, r"B_H changed from 15000 to 21000 nT over 40 km.*at most 44"),
     (later, (40.0, 73.0, 15000.0, 290.0, 20.0), {}, "declination changed from 3.5 to 40 deg over 20 km"),
-    (readings, (f"{READINGS},D", *["1,70,15000,0,0,1"] * 2), {}, "2 columns have the name 'D': keep one of them"),
-    (read_readings, ("none.csv", {}), {}, "cannot read none.csv: .*No such file"),
-    (readings, (READINGS, "1,70,15000,0,0"), {}, "cannot read log.csv: it must hold at least two rows"),
-    (readings, (READINGS, *["1,70,x,0,0"] * 2), {}, "row 1, B_H: 'x' is not a number"),
-    (readings, (READINGS, *["1,70,15000,0,-1"] * 2), {}, "row 1, distance -1 is not from 0 to 40000 km"),
-    (readings, (SPEEDS, *["0,1,70,15000,0,6", "9,1,70,15000,0,-6"]), {}, "row 2, speed -6 is not from 0 to 1000 m_s"),
-    (readings, (READINGS, *["1,70,15000,0,0", "1,70,15000,400,9"]), {}, "row 2, heading 400 is not from -360 to 360"),
-    (readings, (SPEEDS[5:], *["1,70,15000,0,6"] * 2), {}, "speeds need a column 'time' of times"),
-    (readings, (READINGS[:-9], *["1,70,15000,0"] * 2), {}, r"distance or the speed .*\['D', 'I', 'B_H', 'heading'\]"),
-    (
-        readings,
-        (READINGS.replace(",", ";"), *["1,5;70,1;15000;0;0"] * 2),
-        {},
-        "the columns .*D;I;B_H;heading;distance.*, as with decimal commas",
-    ),
-    (readings, (READINGS, *["1,70,15000,0,0"] * 2), {"I": "dip"}, "no column is 'dip': name the column of I, one of"),
 ]
 """Doors, arguments, and messages."""
 
 
-def test_a_speed_gives_the_length_of_a_leg(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    log = readings(f"{SPEEDS}_kn", "0,1,70,15000,0,0", "3600,1,70,15000,0,10", "5400,1,70,15000,0,12")
-    assert log["distance"].tolist() == pytest.approx([0, 18.52, 11.112])
-
-
 @pytest.mark.parametrize("row", range(len(MISTAKES)))
-def test_a_mistake_is_named(row: int, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_mistake_is_named(row: int) -> None:
     door, arguments, options, message = MISTAKES[row]
     with pytest.raises(ValueError, match=message):
         door(*arguments, **options)
