@@ -1,4 +1,4 @@
-"""Infrastructure of a training: configuration, run folder, resume, signals, checkpoints, curves and loggers."""
+"""Infrastructure of a training: configuration, run folder, resume, signals, checkpoints, curves and wandb."""
 
 from magrl.checks import UsageError as UsageError
 from magrl.checks import command as command

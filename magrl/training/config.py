@@ -16,7 +16,7 @@ from magrl.checks import CheckedModel, UsageError, check_device, printable, shor
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document
-from magrl.training.loggers import Logger, WandbMode, check_logger
+from magrl.training.wandb_run import WandbMode
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -41,7 +41,7 @@ Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
 
 
 WANDB_OPTIONS = ("wandb_entity", "wandb_group", "wandb_tags")
-CHANGEABLE = ("device", "logger", "wandb_mode", *WANDB_OPTIONS, "log_every", "checkpoint_every", "out", "resume")
+CHANGEABLE = ("device", "wandb_mode", *WANDB_OPTIONS, "log_every", "checkpoint_every", "out", "resume")
 """Settings that may be edited in ``config.json`` before a run is resumed: they are not part of the training."""
 
 
@@ -65,8 +65,6 @@ class RunConfig(CheckedModel):
     """Folder of an interrupted run to resume, with its settings."""
     device: str = "cpu"
     """Device of all tensors: cpu, cuda, cuda:0, ..."""
-    logger: Logger = "wandb"
-    """Logger of the curves, besides train.csv (docs/training.md); tensorboard needs the extra magrl[tensorboard]."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
     wandb_entity: str = ""
@@ -100,7 +98,6 @@ class RunConfig(CheckedModel):
 
     @model_validator(mode="after")
     def _available(self) -> Self:
-        check_logger(self.logger, self.wandb_mode)
         check_device(self.device)
         return self
 

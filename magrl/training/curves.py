@@ -1,4 +1,4 @@
-"""Statistics of a training, its best policy, and its curves and results: train.csv, figures, eval.json and a logger."""
+"""Statistics of a training, its best policy, and its curves and results: train.csv, figures, eval.json and wandb."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from torch import Tensor, nn
 
 from magrl.checks import check_number
 from magrl.files import append, write_json, write_text, write_with
-from magrl.training.loggers import CurveLog
+from magrl.training.wandb_run import WandbRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OpenLog = Callable[..., CurveLog]
+OpenLog = Callable[..., WandbRun]
 COUNTS = ("frames", "episodes", "iterations", "updates")
 RETURN_TERMS = ("destination", "proximity", "alignment")
 """Terms of the reward whose sums over an episode are reported beside the return."""
@@ -168,20 +168,20 @@ def selection_score(spl: float, success: Tensor, steps: Tensor, max_steps: int) 
 
 
 class RunLog:
-    """Curves and results of a run, written to its folder and to a logger (:mod:`magrl.training.loggers`).
+    """Curves and results of a run, written to its folder and to wandb.
 
     Args:
         folder: run folder.
         columns: columns of ``train.csv``, in order.
-        opens: opens the logger, of a run in wandb that is resumed by its ``run_id``:
-            :func:`magrl.training.loggers.open_log` with its other arguments.
+        opens: opens the run in wandb, given the ``run_id`` of one that is resumed:
+            :class:`magrl.training.wandb_run.WandbRun` with its other arguments.
         resumed: whether the run is resumed; its files stay unchanged until :meth:`load_state_dict`.
         began: ``time.perf_counter()`` at the start of the run; now by default.
 
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     log = RunLog(Path(folder), ["frames", "return"], lambda **_: CurveLog("none", None))
+        ...     log = RunLog(Path(folder), ["frames", "return"], lambda **_: WandbRun(Path(folder), "disabled", {}))
         ...     log.row({"frames": 512, "return": -3.5})
         ...     log.close()
         ...     (log.folder / "train.csv").read_text().split()
@@ -198,7 +198,7 @@ class RunLog:
             self._open([])
 
     def _open(self, rows: Sequence[Mapping[str, float]], wandb_id: str = "") -> None:
-        """Open ``train.csv`` and the logger, and write some rows to both."""
+        """Open ``train.csv`` and the run in wandb, and write some rows to both."""
         self._log = self._open_log(run_id=wandb_id)
         written = [dict(zip(self.columns, self.columns, strict=True)), *rows]
         write_text(self.folder / "train.csv", "".join(map(self._line, written)))
@@ -218,7 +218,7 @@ class RunLog:
         return time.perf_counter() - self._began
 
     def row(self, row: Mapping[str, float]) -> None:
-        """Add a row of curves to the file. ``frames`` is the step of the logger."""
+        """Add a row of curves to the file. ``frames`` is the step in wandb."""
         self.rows.append(dict(row))
         append(self.folder / "train.csv", self._line(row).encode())
         self._log.row(row)
@@ -247,7 +247,7 @@ class RunLog:
         self._open(state_dict["rows"], str(state_dict["wandb_id"]))
 
     def close(self) -> None:
-        """Close the logger."""
+        """Close the run in wandb."""
         self._log.close()
 
 

@@ -37,7 +37,7 @@ from magrl.sensor_std import PERFECT, Noise
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
-from magrl.training.loggers import open_log
+from magrl.training.wandb_run import WandbRun
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
 """Measures of the validation tasks in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
@@ -251,9 +251,9 @@ class Run:
         terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
         columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", "episode_steps", *self.losses)
         columns += tuple(f"eval_{key}" for key in EVALUATED)
-        opened = self.config.logger, self.folder, self.settings, self.config.wandb_mode
         entity, group, tags = (getattr(self.config, name) for name in WANDB_OPTIONS)
-        labeled = partial(open_log, *opened, group=group or self.name, tags=(self.name, *tags), entity=entity)
+        opened = self.folder, self.config.wandb_mode, self.settings
+        labeled = partial(WandbRun, *opened, group=group or self.name, tags=(self.name, *tags), entity=entity)
         return RunLog(self.folder, columns, labeled, resumed=resumed, began=self._began)
 
     @property

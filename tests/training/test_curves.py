@@ -17,7 +17,7 @@ from magrl.training.curves import (
     selection_score,
     training_figure,
 )
-from magrl.training.loggers import CurveLog
+from magrl.training.wandb_run import WandbRun
 
 
 def steps(done: list[bool], success: list[bool], **sums: list[float]) -> TensorDict:
@@ -82,7 +82,7 @@ def test_best_policy_is_the_best() -> None:
 
 def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
     row = {"frames": 512, "return": 1.5, "eval_spl": 88.4, "return_alignment": -0.5}
-    log = RunLog(tmp_path, list(row), lambda **_: CurveLog("none", None))
+    log = RunLog(tmp_path, list(row), lambda **_: WandbRun(tmp_path, "disabled", {}))
     log.row(row)
     with (tmp_path / "train.csv").open(encoding="utf-8") as file:
         assert [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)] == [row]

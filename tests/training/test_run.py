@@ -195,7 +195,7 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
             resumed.load_state_dict(before)
     with pytest.raises(UsageError, match=r"configuration does not fit .*: zeta is 0\.5 in the run folder, 0\.01 in"):
         train(tmp_path, zeta=0.5, scenario=scenario, resume=tmp_path)
-    train(tmp_path, scenario=scenario, resume=tmp_path, logger="csv", checkpoint_every=5.0)
+    train(tmp_path, scenario=scenario, resume=tmp_path, checkpoint_every=5.0)
 
 
 @pytest.mark.parametrize("fault", ["full disk", "folder removed"])

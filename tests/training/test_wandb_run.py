@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -19,10 +18,10 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 
-from magrl.training import loggers
+from magrl.training import wandb_run
 from magrl.training.checkpoints import create_run_folder
 from magrl.training.curves import RunLog
-from magrl.training.loggers import WandbRun, check_logger, open_log, panels
+from magrl.training.wandb_run import WandbRun
 
 ROWS = (
     {"frames": 512, "updates": 8, "seconds": 2.0, "return": 1.5, "loss_critic": 0.25, "eval_spl": 80.0},
@@ -84,7 +83,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setenv("A_SECRET_OF_MINE", "do-not-tell-anyone")
         patch.setenv("WANDB_MODE", "online")
         settings, labels = {"seed": 7, "num_cells": [8, 8]}, {"group": "a-label", "tags": ["a-label"]}
-        log = RunLog(folder, list(ROWS[0]), partial(open_log, "wandb", folder, settings, "offline", **labels))
+        log = RunLog(folder, list(ROWS[0]), partial(WandbRun, folder, "offline", settings, **labels))
         for row in ROWS:
             log.row(row)
         log.figure("trajectories", Figure())
@@ -147,15 +146,15 @@ def test_wandb_writes_to_the_run_folder_and_reports_nothing(tmp_path: Path, monk
     def spy(*_: object) -> None:
         seen.update({name: os.environ.get(name) for name in names})
 
-    monkeypatch.setattr(loggers, "_wandb_logger", spy)
+    monkeypatch.setattr(wandb_run, "_opened", spy)
     WandbRun(tmp_path, "offline", {})
     assert seen == dict.fromkeys(names, str(tmp_path / "wandb")) | {"WANDB_ERROR_REPORTING": "false"}
     assert [os.environ.get(name) for name in names] == [None, "before", None]
 
 
-def resumed(folder: Path, logger: str = "wandb") -> RunLog:
+def resumed(folder: Path) -> RunLog:
     """Return a run that logged both rows, was killed, and is resumed from a checkpoint after the first."""
-    opened = partial(open_log, logger, folder, {}, "offline")
+    opened = partial(WandbRun, folder, "offline", {})
     log = RunLog(folder, list(ROWS[0]), opened)
     log.row(ROWS[0])
     state = log.state_dict()
@@ -178,53 +177,23 @@ def test_resumed_run_of_wandb_continues_its_curve(tmp_path: Path) -> None:
     assert newest.history[1]["time/frames_per_second"] == 256
 
 
-def test_the_same_curves_in_files(tmp_path: Path) -> None:
-    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    for name in ("csv", "tensorboard"):
-        log = resumed(tmp_path, logger=name)
-        log.row({**ROWS[1], "return": 9.0})
-        log.result({"spl": 97.5, "steps": float("nan")})
-        log.close()
-    scalars = tmp_path / "csv" / "scalars"
-    assert (scalars / "train" / "return.csv").read_text(encoding="utf-8").split() == ["512,1.5", "1024,9.0"]
-    assert (scalars / "final" / "spl.csv").read_text(encoding="utf-8").split() == ["1024,97.5"]
-    board = event_accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
-    board.Reload()
-    found = {tag: [(event.step, event.value) for event in board.Scalars(tag)] for tag in board.Tags()["scalars"]}
-    assert (found["train/return"], found["final/spl"]) == ([(512, 1.5), (1024, 9.0)], [(1024, 97.5)])
-    names = {path.relative_to(scalars).with_suffix("").as_posix() for path in scalars.rglob("*.csv")}
-    assert found.keys() == names == panels(ROWS[1]).keys() | {"final/spl"}
-    assert not (tmp_path / "wandb").exists()
-
-
-def test_missing_tensorboard_is_named(tmp_path: Path, monkeypatch) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "tensorboard" else found(name))
-    with pytest.raises(ValueError, match=r"pip install 'magrl\[tensorboard\]'"):
-        open_log("tensorboard", tmp_path, {}, "disabled")
-    assert not list(tmp_path.iterdir())
-    check_logger("csv")
-
-
-def test_failing_loggers_are_reported_and_disabled(tmp_path: Path, monkeypatch, capsys) -> None:
-    """Files that cannot be written, and wandb that is missing, cannot start or fails later."""
+def test_a_failing_wandb_is_reported_and_disabled(tmp_path: Path, monkeypatch, capsys) -> None:
+    """It is missing, fails later, or cannot start."""
 
     def unwritable(*_: object) -> None:
         raise PermissionError("wandb folder")
 
-    real, broken = loggers._wandb_logger, lambda *_: SimpleNamespace()  # a logger that has no experiment
-    (tmp_path / "csv").write_text("in the way", encoding="utf-8")
+    real = wandb_run._opened
     monkeypatch.setitem(sys.modules, "wandb", None)
-    for name, make, reason in (
-        ("csv", real, "File exists"),
-        ("wandb", real, "import of wandb"),
-        ("wandb", broken, "no attribute 'experiment'"),
-        ("wandb", unwritable, "wandb folder"),
+    for make, reason in (
+        (real, "import of wandb"),
+        (lambda *_: SimpleNamespace(), "no attribute 'log'"),
+        (unwritable, "wandb folder"),
     ):
-        monkeypatch.setattr(loggers, "_wandb_logger", make)
-        log = open_log(name, tmp_path, {}, "offline")
+        monkeypatch.setattr(wandb_run, "_opened", make)
+        log = WandbRun(tmp_path, "offline", {})
         log.row(ROWS[0])
         log.summary({"a": 1.0})
         log.close()
-        message = rf"{name} failed and is disabled for the rest of this run: .*{reason}.*\n"
+        message = rf"wandb failed and is disabled for the rest of this run: .*{reason}.*\n"
         assert re.fullmatch(message, capsys.readouterr().err)
