@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import signal
 import sys
 from collections.abc import Callable, Collection, Iterable
 from numbers import Integral, Real
@@ -18,8 +17,6 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from torch import Tensor
-
-from magrl import interrupts
 
 LARGEST = 2.0**64
 """Numbers of arguments and files are below: also float32 holds their squares."""
@@ -335,8 +332,6 @@ def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> Non
     Example:
         >>> command("mine.py", lambda: None)
     """
-    if signal.getsignal(signal.SIGINT) is interrupts.end:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     usage: tuple[type[Exception], ...] = (UsageError, OSError, *errors)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

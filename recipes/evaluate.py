@@ -29,7 +29,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.envs import load_scenario, named_tasks
 from magrl.envs.scenario import RULES
 from magrl.evaluation import Flight, episode_measures, summarize

@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 import places
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import Anywhere, paper
 from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp

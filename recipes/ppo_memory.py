@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import paper
 from magrl.agents import optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp

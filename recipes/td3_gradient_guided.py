@@ -16,7 +16,6 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import paper
 from magrl.agents import (
     AreaGeometry,

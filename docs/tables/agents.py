@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl import score
 from magrl.agents.onnx_policy import exported, with_description
 from magrl.evaluation.tables import markdown_table

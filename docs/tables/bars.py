@@ -16,7 +16,6 @@ import time
 from functools import cache, partial
 from typing import Any
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from currents import CURRENT_RULES
 from magrl.envs.navigation import NAMED_ENVS, storm_errors
 from magrl.evaluation import evaluation_rollout

@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import Flight, evaluation_rollout

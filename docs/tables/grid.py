@@ -22,7 +22,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.benchmark import COLUMNS, episode_table, write_episodes
 from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.tables import markdown_table

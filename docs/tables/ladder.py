@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from bars import BARS, flown
 from magrl.envs.navigation import storm_errors
 from magrl.evaluation.scores import scored

@@ -14,7 +14,6 @@ import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF
 from magrl.field.elements import measured_elements

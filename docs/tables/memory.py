@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from bars import BARS
 from magrl import paper
 from magrl.envs import planet_scenario

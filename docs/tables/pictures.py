@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.envs import Region
 from magrl.envs.navigation import task_transforms
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines

@@ -13,7 +13,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from magrl.evaluation.tables import markdown_table
 from magrl.files import read_text, write_text
 from magrl.training import UsageError, command

@@ -30,7 +30,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import magrl.interrupts  # noqa: F401 - before what takes seconds
 from agents import keep_agents, save_agent
 from bars import BARS, VEHICLES, bar, bars_of
 from flights import write_picture
