@@ -15,10 +15,8 @@ import shutil
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +26,12 @@ from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, read_document, read_text, write_text
 from magrl.training import UsageError, command
 
-import torch
 import tyro
 from pandas import read_csv
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
 from flights import ABOUT, MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of, titles_of
-from workers import die_with_parent
+from workers import Backend, mapped
 
 from evaluate import Config, evaluate
 
@@ -49,6 +45,7 @@ def flights(
     against: Sequence[Sequence[int]] = (),
     measures: Sequence[str] = MEASURES,
     jobs: int = 1,
+    backend: Backend = "loky",
     device: str = "cpu",
     **options: Any,
 ) -> Table:
@@ -63,7 +60,9 @@ def flights(
     region = made.scenario.tasks.region
     known = [names(navigator, made.target_std) for navigator in navigators]
     titles = titles_of(ABOUT, known)
-    cells = mapped(partial(episodes_of, options, device), list(itertools.product(navigators, made.errors)), jobs)
+    cells = mapped(
+        partial(episodes_of, options, device), list(itertools.product(navigators, made.errors)), jobs, backend
+    )
     for name, about_it in zip(titles, known, strict=True):
         episodes = {level: next(cells) for level in made.errors}
         shares[name] = [runs[0][share].double() for runs in episodes.values()]
@@ -82,21 +81,6 @@ def episodes_of(options: Mapping[str, Any], device: str, chosen: tuple[Spec, str
     """Return the episodes of a navigator at one level of errors, once for each run."""
     (navigator, level), made = chosen, Flights.of(**options)
     return made.episodes(navigator, made.errors[level], device)
-
-
-def begin_worker() -> None:
-    """Give this process one thread, and end it with its parent."""
-    die_with_parent()
-    torch.set_num_threads(1)
-
-
-def mapped(function: Callable[[Any], Any], values: Sequence[Any], jobs: int) -> Iterator[Any]:
-    """Yield the results of a function in the order of its values, in some processes of one thread each."""
-    if jobs == 1:
-        yield from tqdm(map(function, values), total=len(values), unit="cell")
-        return
-    with ProcessPoolExecutor(jobs, get_context("spawn"), begin_worker) as pool:
-        yield from tqdm(pool.map(function, values), total=len(values), unit="cell")
 
 
 def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> Table:
@@ -126,6 +110,7 @@ def make(
     tasks: int | None = None,
     confidence: float | None = None,
     jobs: int | None = None,
+    backend: Backend | None = None,
     device: str | None = None,
     out: Path | None = None,
 ) -> None:
@@ -137,6 +122,7 @@ def make(
         tasks: Number of tasks; by default from tables.toml.
         confidence: Minimum probability at which vehicles declare their arrival; by default from tables.toml.
         jobs: Processes that fly, with one thread each; of tables of the kind flights.
+        backend: Where they are: loky on this machine, ray on a cluster.
         device: Device of the flights: cpu, cuda, cuda:0, ...
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 
@@ -144,7 +130,7 @@ def make(
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
     specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence}
-    changes |= {"jobs": jobs, "device": device}
+    changes |= {"jobs": jobs, "backend": backend, "device": device}
     changes = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in tables if name not in specs]:
         raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(specs)}")

@@ -22,11 +22,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +41,7 @@ from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
 from magrl.registry import NAMED_TASKS
 from magrl.training import UsageError, command
-from workers import die_with_parent
+from workers import Backend, mapped
 
 import numpy as np
 import torch
@@ -53,7 +51,6 @@ from pandas import DataFrame, Series, concat, read_csv
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
-from tqdm import tqdm
 
 POINTS, FEW = 10, 200
 """Points of a learning curve, and their episodes."""
@@ -107,6 +104,8 @@ class Config:
     """Seeds of weights, exploration and training tasks."""
     jobs: int = 2
     """Runs at a time, with one thread each."""
+    backend: Backend = "loky"
+    """Where they run: loky on this machine, ray on a cluster with a common folder."""
     train: bool = True
     """Whether to train what is missing."""
     out: Path = Path("runs/sweep")
@@ -163,7 +162,7 @@ def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
     began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
     line = [sys.executable, Path(__file__).parents[2] / "recipes" / script, *options]
-    done = subprocess.run(line, capture_output=True, encoding="utf-8", preexec_fn=die_with_parent, check=False)
+    done = subprocess.run(line, capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         raise UsageError(f"{script} ended with status {done.returncode}: {done.stderr.strip().rpartition(chr(10))[2]}")
     points = [row for row in csv.DictReader(read_text(folder / "train.csv").splitlines()) if row["eval_spl"]]
@@ -174,8 +173,9 @@ def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
     return [*rows, rows[-1] | {"cpu_s": cpu_s} | final]
 
 
-def run(config: Config, task: str, name: str, seed: int) -> Path:
+def run(config: Config, job: tuple[str, str, int]) -> Path:
     """Train one run, unless its file exists; return the file."""
+    task, name, seed = job
     path = config.out / f"{task}-{name}-seed{seed}.csv"
     if not path.exists():
         shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
@@ -265,9 +265,8 @@ def main(args: Sequence[str] | None = None) -> None:
     jobs = list(planned(config))
     if config.train:
         os.environ["OMP_NUM_THREADS"] = "1"
-        with locked(config.out), ProcessPoolExecutor(config.jobs, get_context("spawn"), die_with_parent) as pool:
-            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
-                done.result()
+        with locked(config.out):
+            list(mapped(partial(run, config), jobs, config.jobs, config.backend, "run"))
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
     if not paths:
         raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")

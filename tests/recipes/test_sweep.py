@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import runpy
-import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -38,7 +35,7 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     monkeypatch.setitem(sweep.ALGORITHMS, name, chosen._replace(num_envs=8, settings=settings))
     monkeypatch.setitem(sweep.NAMED_TASKS, task, sweep.NAMED_TASKS[task]._replace(budget={name: 0.032}))
     job = (sweep.Config(out=tmp_path), task, name, 0)
-    rows = read_csv(sweep.run(*job))
+    rows = read_csv(sweep.run(job[0], job[1:]))
     assert rows["steps"].tolist() == [8, 16, 32, 32]
     assert rows[["task", "algorithm", "seed"]].drop_duplicates().to_numpy().tolist() == [[*job[1:]]]
     assert rows[["SR", "SPL"]].to_numpy().min() >= 0
@@ -46,14 +43,14 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     kept = score(tmp_path / f"{task}-{name}-seed0.onnx", task, episodes=4, max_steps=2)
     assert rows[["SPL", "return"]].iloc[-1].tolist() == pytest.approx([kept["SPL"], kept["return"]], abs=0.02)
     monkeypatch.setattr(sweep, "trained", None)
-    assert len(read_csv(sweep.run(*job))) == len(rows)
+    assert len(read_csv(sweep.run(job[0], job[1:]))) == len(rows)
 
 
 def test_an_interrupted_training_by_a_recipe_begins_again(tmp_path: Path, monkeypatch) -> None:
     """The recipe refuses the folder of a run."""
     (tmp_path / "box-GG-TD3-seed0").mkdir()
     monkeypatch.setattr(sweep, "recipe", lambda *about: [{"steps": about[-1].exists()}])
-    assert read_csv(sweep.run(sweep.Config(out=tmp_path), "box", "GG-TD3", 0))["steps"].tolist() == [False]
+    assert read_csv(sweep.run(sweep.Config(out=tmp_path), ("box", "GG-TD3", 0)))["steps"].tolist() == [False]
 
 
 def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
@@ -76,25 +73,6 @@ def test_a_recipe_that_fails_says_why(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sweep.RECIPES, "GG-TD3", (str(tmp_path / "fails.py"),))
     with pytest.raises(UsageError, match=r"fails\.py ended with status 1: no power"):
         sweep.recipe("box", "GG-TD3", 0, tmp_path)
-
-
-def test_no_process_is_left_after_a_kill() -> None:
-    """A worker, and the recipe that it runs, end with the parent."""
-    code = (
-        "import ctypes, signal, subprocess, sys, time\n"
-        f"{inspect.getsource(sweep.die_with_parent)}\n"
-        "child = subprocess.Popen(['sleep', '60'], preexec_fn=die_with_parent)\n"
-        "print(child.pid, flush=True)\n"
-        "time.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, encoding="utf-8") as parent:
-        child = Path("/proc", parent.stdout.readline().strip())
-        assert child.exists()
-        parent.kill()
-    end = time.monotonic() + 5
-    while (state := child / "stat").exists() and state.read_text("utf-8").split()[2] != "Z" and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not state.exists() or state.read_text("utf-8").split()[2] == "Z"
 
 
 @pytest.mark.parametrize("name", ["bars", "publish"])
