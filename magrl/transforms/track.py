@@ -131,14 +131,6 @@ class TrackField(StatefulTransform):
             self._add(observation_spec, like, key, OBSERVATION_SIZE)
         return observation_spec
 
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make the state part of the input."""
-        input_spec = ObservationTransform.transform_input_spec(self, input_spec)
-        if self.parent is None:
-            return input_spec
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        return with_state(input_spec, {key: observed[key] for key in self.state_keys})
-
 
 @cache
 def _leaves(dtype: torch.dtype) -> TensorDict:

@@ -152,6 +152,49 @@ class EpisodeErrors(EpisodeNumbers):
 
     true_keys: ClassVar[tuple[str, ...]] = ()
     """Keys of true values."""
+    hidden: ClassVar[Mapping[str, str]] = {}
+    """Keys by name that are replaced for the vehicle alone, with the keys of their true values: the environment gets
+    these back for its step. A heading keeps its bounds, elements are unbounded."""
+
+    def __init__(self, *keys: Keys | None, **options: Any) -> None:
+        super().__init__(*keys, **options)
+        if self.hidden:
+            named = self._named(self.in_keys)
+            self.in_keys_inv, self.out_keys_inv = [named[name] for name in self.hidden], list(self.hidden.values())
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it."""
+        return [self.numbers_key, self.stream_key, *self.hidden.values()]
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Give the true values to the environment."""
+        state = self._state(tensordict) if self.hidden else None
+        for key, value in zip(self.in_keys_inv, state[2:], strict=True) if state is not None else ():
+            tensordict.set(key, value)
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the numbers, their state, and what is hidden."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        ins, outs = self._named(self.in_keys), dict(zip(self.out_names, self.out_keys, strict=True))
+        for name, true in self.hidden.items():
+            leaf = observation_spec[ins[name]]
+            observation_spec[true] = leaf.clone()
+            if name == "heading":
+                observation_spec[outs[name]] = leaf.clone()
+            else:
+                self._add(observation_spec, leaf, outs[name], *leaf.shape[-1:])
+        return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Make the state, and elements that are replaced, part of the input."""
+        input_spec = super().transform_input_spec(input_spec)
+        state = input_spec["full_state_spec"]
+        for name, key in zip(self.hidden, self.in_keys_inv, strict=False):
+            if name != "heading" and state is not None and key in state.keys(True, True):
+                self._add(state, state[key], key, *state[key].shape[-1:])
+        return input_spec
 
     @classmethod
     def from_options(cls, options: Any, speed_km_h: float, seed: int = 0) -> EpisodeErrors:

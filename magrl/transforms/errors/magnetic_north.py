@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite
 
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
@@ -47,6 +46,7 @@ class MagneticNorth(ReadingErrors):
 
     channel, changes_inclination = 6, False
     true_keys = ("true_field", "true_heading", "true_target_field")
+    hidden = {"heading": "true_heading", "target_field": "true_target_field"}
     default_in_keys = ("heading", "field", "target_field")
     default_out_keys = default_in_keys
     numbers_key, stream_key = "compass_declination", "compass_stream"
@@ -56,13 +56,7 @@ class MagneticNorth(ReadingErrors):
     def __init__(self, in_keys: Keys | None = None) -> None:
         super().__init__(in_keys)
         self.out_keys: list[NestedKey] = list(self.in_keys)
-        self.in_keys_inv, self.out_keys_inv = [self.in_keys[0], self.in_keys[2]], list(self.true_keys[1:])
         self._set_accuracy()
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it."""
-        return [self.numbers_key, self.stream_key, *self.true_keys[1:]]
 
     def _constants(self, stream: Tensor) -> Tensor:
         return torch.zeros_like(stream.unsqueeze(-1), dtype=torch.get_default_dtype())
@@ -87,30 +81,6 @@ class MagneticNorth(ReadingErrors):
         """
         none = torch.zeros_like(field)
         return SensorStd(none, none + field.new_tensor((math.inf, 0.0, 0.0)), none, none)
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give the true heading and the elements of the destination to the environment."""
-        state = self._state(tensordict)
-        if state is not None:
-            tensordict.set(self.in_keys_inv[0], state[-2]).set(self.in_keys_inv[1], state[-1])
-        return tensordict
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add what is true and the state; the elements are unbounded."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        for true, key in zip(self.true_keys[1:], self.in_keys_inv, strict=True):
-            leaf = observation_spec[key]
-            observation_spec[true] = leaf.clone()
-            self._add(observation_spec, leaf, key, *leaf.shape[-1:])
-        return observation_spec
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Make the state, and the elements of the destination without D, part of the input."""
-        input_spec = super().transform_input_spec(input_spec)
-        state, key = input_spec["full_state_spec"], self.in_keys_inv[1]
-        if state is not None and key in state.keys(True, True):
-            self._add(state, state[key], key, *state[key].shape[-1:])
-        return input_spec
 
 
 def _without_declination(elements: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import pad
-from torchrl.data import Composite
 
 from magrl.checks import check_choice, check_number
 from magrl.counters import stream_normal
@@ -90,6 +89,7 @@ class NorthReferenceError(ReadingErrors):
 
     channel, changes_inclination = 3, False
     true_keys = ("true_field", "true_heading")
+    hidden = {"heading": "true_heading"}
     default_in_keys = ("heading", "field", "leg")
     default_out_keys = ("heading", "field")
     optional_in_keys = ("position",)
@@ -111,7 +111,6 @@ class NorthReferenceError(ReadingErrors):
     ) -> None:
         super().__init__(in_keys, out_keys, **options)
         self.out_keys: list[NestedKey] = self.in_keys[:2] if out_keys is None else self.out_keys
-        self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [self.true_keys[1]]
         check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
         check_number(0, above=True, optional=not drift_deg, drift_length_km=drift_length_km)
@@ -141,11 +140,6 @@ class NorthReferenceError(ReadingErrors):
         return MagneticNorth() if options == MAGNETIC else north_reference(options, speed_km_h=speed_km_h, seed=seed)
 
     # Data
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it."""
-        return [self.numbers_key, self.stream_key, self.true_keys[1]]
 
     def _constants(self, stream: Tensor) -> Tensor:
         normal = stream_normal(stream, 1).to(torch.get_default_dtype())
@@ -178,18 +172,6 @@ class NorthReferenceError(ReadingErrors):
         constant, drift, random = self.sizes
         of_declination = field.new_tensor((1.0, 0.0, 0.0)).expand_as(field)
         return SensorStd(*(size * of_declination for size in (random, math.hypot(constant, drift), drift, 0.0)))
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give the true heading to the environment."""
-        state = self._state(tensordict)
-        return tensordict if state is None else tensordict.set(self.in_keys_inv[0], state[-1])
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add what is true, the error and the state of the numbers; the elements are unbounded."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        for key in (self.true_keys[1], self.out_keys[0]):
-            observation_spec[key] = observation_spec[self.in_keys[0]].clone()
-        return observation_spec
 
 
 def _secant(inclination: Tensor) -> Tensor:

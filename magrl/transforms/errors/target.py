@@ -7,9 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite
 
 from magrl.counters import stream_normal
 from magrl.transforms.base import Keys
@@ -43,6 +41,7 @@ class TargetErrors(EpisodeErrors):
 
     channel = 12
     true_keys = ("exact_target_field",)
+    hidden = {"target_field": "exact_target_field"}
     default_in_keys = default_out_keys = ("target_field",)
     numbers_key, stream_key = "target_error", "target_stream"
     in_sizes = {"target_field": (3,)}
@@ -54,12 +53,6 @@ class TargetErrors(EpisodeErrors):
         super().__init__(in_keys, in_keys, **options)
         check_sizes(3, target_std=target_std)
         self.target_std = tuple(target_std)
-        self.in_keys_inv, self.out_keys_inv = list(self.in_keys), list(self.true_keys)
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it."""
-        return [self.numbers_key, self.stream_key, *self.true_keys]
 
     def _constants(self, stream: Tensor) -> Tensor:
         return torch.tensor(self.target_std, device=stream.device) * stream_normal(stream, self.draws)
@@ -68,24 +61,3 @@ class TargetErrors(EpisodeErrors):
         tensordict.set(self.true_keys[0], values[0])
         tensordict.set(self.out_keys[0], folded(values[0] + episode.numbers))
         return episode.numbers
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give the exact elements to the environment."""
-        state = self._state(tensordict)
-        return tensordict if state is None else tensordict.set(self.in_keys_inv[0], state[-1])
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the exact elements and the state; the elements with an error are unbounded."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        leaf = observation_spec[self.in_keys[0]]
-        observation_spec[self.true_keys[0]] = leaf.clone()
-        self._add(observation_spec, leaf, self.out_keys[0], 3)
-        return observation_spec
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Make the state, and the elements with an error, part of the input."""
-        input_spec = super().transform_input_spec(input_spec)
-        state, key = input_spec["full_state_spec"], self.in_keys_inv[0]
-        if state is not None and key in state.keys(True, True):
-            self._add(state, state[key], key, 3)
-        return input_spec
