@@ -7,8 +7,6 @@ transforms and is used like every other navigator.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,9 +23,10 @@ from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with
 from magrl.checks import check_device, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.scenario import rule_settings
-from magrl.files import save_tensors, write_atomically
+from magrl.files import write_atomically
 from magrl.navigators import Anywhere, Memory, Navigator
-from magrl.tracking.network import FILE_FORMAT, check_weights, policy_content, save_pilot
+from magrl.policy_files import PolicyFile, read_policy, reading
+from magrl.tracking.network import save_pilot
 from magrl.transforms import LegsView, ObservationView, ReadingView
 
 View = ObservationView | LegsView | ReadingView
@@ -217,7 +216,7 @@ def export_policy(actor: nn.Module | Path | str, view: View) -> FieldPolicy:
     if isinstance(actor, nn.Module):
         network = exported(actor, view.size)
     else:
-        with _reading(actor):
+        with reading(actor):
             network = OnnxNetwork(Path(actor).read_bytes(), view.size)
     return FieldPolicy(PolicyConfig(view, None), network)
 
@@ -259,15 +258,13 @@ def save_policy(path: Path | str, policy: nn.Module | Path | str, view: View | N
     if network != (Path(path).suffix == ".onnx"):
         kind = "an exported network ends with .onnx, another policy does not"
         raise ValueError(f"the file of {kind}, got {str(path)!r}")
-    config["kind"] = next(name for name, kind in VIEWS.items() if isinstance(policy.view, kind))
+    kind = next(name for name, kind in VIEWS.items() if isinstance(policy.view, kind))
     if network:
-        described = {"kind": config["kind"], "view": config["view"]}
-        write_atomically(Path(path), with_description(policy.actor.content, described))
+        write_atomically(Path(path), with_description(policy.actor.content, {"kind": kind, "view": config["view"]}))
         return
     policy.check_actor()
     weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
-    content = {"format": FILE_FORMAT, "config": config, "weights": weights, "training": policy.training}
-    save_tensors(content, Path(path))
+    PolicyFile(kind, config, weights, policy.training).write(path)
 
 
 def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | Anywhere | Memory:
@@ -290,13 +287,14 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     check_device(device)
     if Path(path).suffix == ".onnx" and Path(path).is_file():
         return _load_onnx(path).to(device).eval()
-    content = policy_content(path)
-    if "rules" in content:
-        return Anywhere(source=path).to(device).eval()
-    if "memory" in content:
-        return Memory(path).to(device).eval()
-    with _reading(path):
-        return _rebuild(**content).to(device).eval()
+    file = read_policy(path, "pilot", "memory", *VIEWS)
+    if file.kind in ("pilot", "memory"):
+        return (Anywhere if file.kind == "pilot" else Memory)(source=path).to(device).eval()
+    with reading(path):
+        config = _config(file.kind, **file.config)
+        policy = FieldPolicy(config, file.network(config.make_actor))
+        policy.training = TrainingSettings(**file.training).model_dump(exclude_unset=True)
+    return policy.to(device).eval()
 
 
 def _config(kind: str, view: Any, num_cells: Any = None, **shape: Any) -> PolicyConfig:
@@ -307,28 +305,6 @@ def _config(kind: str, view: Any, num_cells: Any = None, **shape: Any) -> Policy
 def _load_onnx(path: Path | str) -> FieldPolicy:
     """Return the policy of an ONNX file."""
     content = Path(path).read_bytes()
-    with _reading(path):
+    with reading(path):
         config = _config(**description_of(content))
         return FieldPolicy(config, OnnxNetwork(content, config.view.size))
-
-
-@contextmanager
-def _reading(path: Path | str) -> Iterator[None]:
-    """Name the file in the error of foreign content, whatever it raises."""
-    try:
-        yield
-    except (FileNotFoundError, ImportError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{path} does not hold a valid policy: {' '.join(str(error).split())}") from error
-
-
-def _rebuild(config: Any, weights: Any, training: Any = None) -> FieldPolicy:
-    rebuilt = _config(**config)
-    # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
-    rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
-    check_weights(weights)
-    policy = FieldPolicy(rebuilt)
-    policy.actor.load_state_dict(weights)
-    policy.training = TrainingSettings(**training or {}).model_dump(exclude_unset=True)
-    return policy

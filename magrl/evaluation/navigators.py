@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +13,9 @@ from magrl.agents.policy import TrainingSettings
 from magrl.checks import check_type, printable, short
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import NAVIGATORS, Anywhere, Memory, Navigator
+from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.network import policy_content, pretrained
+from magrl.tracking.network import pretrained
 
 
 class Agent(NamedTuple):
@@ -110,9 +111,9 @@ def _kind_of(file: Path) -> Kind:
         raise FileNotFoundError(f"there is no policy file at {printable(str(file))[:200]}")
     if file.suffix == ".zip":
         raise ValueError(f"{file} is a model of stable-baselines3: load it, as PPO.load(path), and pass the model")
-    content = {} if file.suffix == ".onnx" else policy_content(file)
-    if "rules" in content or "memory" in content:
-        return Anywhere if "rules" in content else Memory
+    content = _content_of(file)
+    if content.kind in ("pilot", "memory"):
+        return Anywhere if content.kind == "pilot" else Memory
     training = _training(file, content)
     if training.get("guided") is None:
         return Agent(*[file.parent.name if file.stem == "policy" else file.stem] * 3)
@@ -208,10 +209,10 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
 def _trained_with(text: str) -> dict[str, Any]:
     """Return the settings in the file of a policy; none of a navigator without one."""
     path = named(text).file
-    if path is None or path.suffix == ".onnx":
+    if path is None:
         return {}
-    content = policy_content(path)
-    found = {"zeta": content["rules"]["zeta"]} if "rules" in content else _training(path, content)
+    content = _content_of(path)
+    found = {"zeta": content.config["rules"]["zeta"]} if content.kind == "pilot" else _training(path, content)
     found.pop("guided", None)
     if "noise" in found:
         found["errors"] = tuple(found.pop("noise"))
@@ -220,12 +221,15 @@ def _trained_with(text: str) -> dict[str, Any]:
     return found
 
 
-def _training(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+def _content_of(path: Path) -> PolicyFile:
+    """Return what a file says of its policy; ONNX files say nothing of their training."""
+    return PolicyFile("onnx", {}, {}) if path.suffix == ".onnx" else read_policy(path)
+
+
+def _training(path: Path, content: PolicyFile) -> dict[str, Any]:
     """Return the settings of a training in the file of its policy, checked."""
-    try:
-        return TrainingSettings(**content.get("training") or {}).model_dump(exclude_unset=True)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path} does not hold a valid policy: {error}") from error
+    with reading(path):
+        return TrainingSettings(**content.training).model_dump(exclude_unset=True)
 
 
 def _content(value: Any) -> Any:

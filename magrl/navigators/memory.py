@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from magrl.checks import check_number
-from magrl.files import save_tensors
 from magrl.geodesy import polar, steer
 from magrl.navigators.base import Navigator
-from magrl.tracking.network import (
-    FILE_FORMAT,
-    check_entries,
-    check_weights,
-    correction_network,
-    policy_content,
-    pretrained,
-)
+from magrl.policy_files import PolicyFile, read_policy, reading
+from magrl.tracking.network import correction_network, pretrained
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE, observed_reading
 
 LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}
@@ -129,21 +122,11 @@ class Memory(Navigator):
 
     @classmethod
     def _read(cls, path: Path | str | None) -> tuple[MemoryNetwork, Sequence[Sequence[float]] | None]:
-        path = path or pretrained(cls.name)
-        content = policy_content(path)
-        try:
-            check_entries(content, "memory", "weights")
-            described, weights = {"accuracy": None, **content["memory"]}, content["weights"]
-            check_entries(described, "size", "accuracy")
-            size, accuracy = described["size"], described["accuracy"]
+        file = read_policy(path or pretrained(cls.name), "memory")
+        with reading(path or cls.name):
+            accuracy = file.config["accuracy"]
             _ends(accuracy)
-            # Compares the shapes before anything is allocated: a few bytes may ask for any size
-            network = MemoryNetwork(size, "meta")
-            network.load_state_dict(weights, assign=True)
-            check_weights(weights)
-        except Exception as error:  # whatever foreign content raises
-            raise ValueError(f"{path} does not hold a valid memory: {' '.join(str(error).split())}") from error
-        return network.requires_grad_(False).eval(), accuracy
+            return file.network(partial(MemoryNetwork, file.config["size"])), accuracy
 
     def save(self, path: Path | str) -> None:
         """Write the network, for the argument ``source``.
@@ -151,11 +134,9 @@ class Memory(Navigator):
         Raises:
             OSError: if the file cannot be written.
         """
-        described: dict[str, Any] = {"size": self.network.size}
-        if self.accuracy.isfinite().all():
-            described["accuracy"] = self.accuracy.flatten(1).tolist()
-        content: dict[str, Any] = {"format": FILE_FORMAT, "memory": described}
-        save_tensors(content | {"weights": dict(self.network.state_dict())}, Path(path))
+        ends = self.accuracy.flatten(1).tolist() if self.accuracy.isfinite().all() else None
+        config = {"size": self.network.size, "accuracy": ends}
+        PolicyFile("memory", config, dict(self.network.state_dict())).write(path)
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return an empty memory, and the first reading."""

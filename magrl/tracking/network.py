@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from magrl.checks import check_choice, check_finite, check_number, check_type, short
-from magrl.files import load_tensors, save_tensors
+from magrl.checks import check_choice, check_number, check_type
+from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.tracking.observation import OBSERVATION_SIZE
 from magrl.tracking.pilot import Rules
 
-FILE_FORMAT = 5
-"""Format of the files of policies."""
 MOST_LAYERS = 64
 """Largest number of hidden layers."""
-LARGEST_WEIGHT = 1e6
-"""Largest size of a weight in a file."""
 _PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
 
 
@@ -67,51 +63,9 @@ def save_pilot(path: Path | str, rules: Rules, network: nn.Module | None) -> Non
     """
     if not isinstance(network, nn.Sequential):
         raise TypeError(f"the network of a pilot must be one of correction_network, got {type(network).__name__}")
-    weights = {key: value for key, value in network.state_dict().items() if isinstance(value, Tensor)}
     num_cells = [layer.out_features for layer in network if isinstance(layer, nn.Linear)][:-1]
     plain = rules.model_dump(exclude={"model", "start_km", "target_km", "target_std"})
-    content = {"format": FILE_FORMAT, "rules": plain, "num_cells": num_cells, "weights": weights}
-    save_tensors(content, Path(path))
-
-
-def policy_content(path: Path | str) -> dict[str, Any]:
-    """Return the content of the file of a policy of any kind.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: for a damaged file, or one of another format.
-    """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no policy file at {path}")
-    content = load_tensors(path)
-    version = content.pop("format", None) if isinstance(content, dict) else None
-    if version != FILE_FORMAT:
-        raise ValueError(
-            f"{path} is a policy of format {short(version)}; this version reads format {FILE_FORMAT}: train it again"
-        )
-    return content
-
-
-def check_weights(weights: Mapping[str, Tensor]) -> None:
-    """Raise unless weights are real, finite, and at most :data:`LARGEST_WEIGHT` in size.
-
-    Example:
-        >>> check_weights({"bias": torch.zeros(2)})
-    """
-    check_finite(weights.items(), "weights")
-    for name, weight in weights.items():
-        if not weight.is_floating_point() or (weight.abs() > LARGEST_WEIGHT).any():
-            raise ValueError(f"{name} must hold real numbers of size up to {LARGEST_WEIGHT:g}, got {weight.dtype}")
-
-
-def check_entries(content: Mapping[str, Any], *names: str) -> None:
-    """Raise unless the content of the file of a policy has these entries and no other.
-
-    Example:
-        >>> check_entries({"rules": {}}, "rules")
-    """
-    if set(content) != set(names):
-        raise ValueError(f"its entries must be {sorted(names)}, got {short(sorted(content))}")
+    PolicyFile("pilot", {"rules": plain, "num_cells": num_cells}, dict(network.state_dict())).write(path)
 
 
 def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
@@ -126,21 +80,10 @@ def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
         >>> rules.max_steps, len(network)
         (120, 10)
     """
-    content = policy_content(path)
-    try:
-        entries = "rules", "num_cells", "weights"
-        check_entries(content, *entries)
-        stated, cells, weights = (content[name] for name in entries)
-        if "max_turn_rad" in stated:  # of an older file
-            stated["max_turn_deg"] = math.degrees(stated.pop("max_turn_rad"))
-        rules = Rules(**stated)
-        # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
-        network = correction_network(cells, "meta")
-        network.load_state_dict(weights, assign=True)
-        check_weights(weights)
-    except Exception as error:  # whatever foreign content raises
-        raise ValueError(f"{path} does not hold a valid pilot: {' '.join(str(error).split())}") from error
-    return rules, network.float().requires_grad_(False).eval()
+    file = read_policy(path, "pilot")
+    with reading(path):
+        rules = Rules(**file.config["rules"])
+        return rules, file.network(partial(correction_network, file.config["num_cells"]))
 
 
 def pretrained(name: str) -> Path:
@@ -173,6 +116,6 @@ def pilot_of(navigator: str | Path | nn.Module) -> tuple[Rules, nn.Module | None
     if isinstance(rules, Rules):
         return rules, copy.deepcopy(getattr(navigator, "network", None))
     path = pretrained("anywhere") if navigator == "anywhere" else navigator
-    if isinstance(path, Path) or (str(path).endswith(".safetensors") and "rules" in policy_content(str(path))):
+    if isinstance(path, Path) or (str(path).endswith(".safetensors") and read_policy(str(path)).kind == "pilot"):
         return load_pilot(str(path))
     return None

@@ -79,7 +79,7 @@ def test_damaged_policy_is_refused(policy, tmp_path: Path) -> None:
     for change, message in (
         (
             lambda c: c | {"format": [1] * 10**5},
-            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 5: train it again",
+            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 6: train it again",
         ),
         (lambda c: c | {"extra": 1}, "unexpected keyword argument 'extra'"),
         (lambda c: c | {"config": {"num_cells": (16,)}}, "view"),

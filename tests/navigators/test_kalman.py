@@ -79,7 +79,7 @@ def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": [1] * 10**5}, r"format \[1, 1, .{70}\.\.\.; this version reads format 5: train it again"),
+        ({"format": [1] * 10**5}, r"format \[1, 1, .{70}\.\.\.; this version reads format 6: train it again"),
         ({"rules": {"max_steps": 0}}, "max_steps"),
         ({"rules": {"speed": 3}}, "speed"),
         ({"num_cells": [10**9]}, "num_cells must be"),
@@ -90,7 +90,9 @@ def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
 def test_damaged_files_are_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.safetensors"
     magrl.save_policy(path, Anywhere(source=correction_network((8,))))
-    save_tensors(load_tensors(path) | change, path)
+    content = load_tensors(path)
+    config = {"config": content["config"] | {key: change[key] for key in change.keys() & content["config"].keys()}}
+    save_tensors(content | config | {key: change[key] for key in change.keys() & content.keys()}, path)
     with pytest.raises(ValueError, match=message) as error:
         Anywhere(source=path)
     assert str(path) in str(error.value)

@@ -140,12 +140,12 @@ def test_a_file_of_an_agent_holds_its_network_and_no_other(tmp_path) -> None:
     save_policy(tmp_path / "memory.safetensors", Memory(saved))
     found = Memory(tmp_path / "memory.safetensors").network.state_dict()
     assert all(torch.equal(weight, found[name]) for name, weight in saved.state_dict().items())
-    with pytest.raises(ValueError, match=r"anywhere\.safetensors does not hold a valid memory"):
+    with pytest.raises(ValueError, match=r"anywhere\.safetensors .* of the kind .pilot., expected is memory"):
         Memory(pretrained("anywhere"))
     with torch.no_grad():
         saved.gru.weight_hh_l0[0, 0] = torch.nan
     save_policy(tmp_path / "broken.safetensors", Memory(saved))
-    with pytest.raises(ValueError, match=r"broken\.safetensors does not hold a valid memory: .*weight_hh_l0"):
+    with pytest.raises(ValueError, match=r"broken\.safetensors does not hold a valid policy: .*weight_hh_l0"):
         Memory(tmp_path / "broken.safetensors")
 
 
