@@ -1,13 +1,11 @@
-"""Readings that do not fit the field at their places, and the mistakes that explain them."""
+"""A reading that does not fit the field at its place, and the mistake that explains it."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector, measured_elements
+from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector
 
 MODEL_STD = (0.26, 0.20, 133.0)
 """Standard deviations of D [deg], I [deg], B_H [nT] of a model of the core, which omits crust and currents.
@@ -47,66 +45,51 @@ def _most(expected: Tensor, std: Tensor) -> Tensor:
     return MOST_SIGMAS * std + slack
 
 
-def deviation(elements: Tensor, expected: Tensor, std: Tensor) -> list[str | None]:
-    """Return how each reading deviates from expected elements, as text; None for one that fits.
+def deviation(elements: Tensor, expected: Tensor, std: Tensor) -> str | None:
+    """Return how a reading deviates from expected elements, as text; None for one that fits.
 
     Args:
-        elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
-        expected: ``(N, 3)`` the elements at their places.
-        std: ``(..., 3)`` standard deviations of the difference.
+        elements: ``(3,)`` D [deg], I [deg], B_H [nT].
+        expected: ``(3,)`` the elements at its place.
+        std: ``(3,)`` standard deviations of the difference.
 
     Example:
-        >>> deviation(torch.tensor([[3.4, -73.1, 14950.0]]), torch.tensor([[3.5, 73.0, 15000.0]]), torch.zeros(3))
-        ['I deviates by 146.1, where 0.112 is likely']
+        >>> deviation(torch.tensor([3.4, -73.1, 14950.0]), torch.tensor([3.5, 73.0, 15000.0]), torch.zeros(3))
+        'I deviates by 146.1, where 0.112 is likely'
     """
     off, most = element_difference(elements, expected).abs(), _most(expected, std)
-    worst = (off / most).max(-1)
-    rows = zip(worst.values.tolist(), worst.indices.tolist(), off.tolist(), most.tolist(), strict=True)
-    return [
-        f"{NAMES[k]} deviates by {values[k]:.4g}, where {limits[k]:.3g} is likely" if share > 1 else None
-        for share, k, values, limits in rows
-    ]
+    worst = int((off / most).argmax())
+    if off[worst] <= most[worst]:
+        return None
+    return f"{NAMES[worst]} deviates by {off[worst]:.4g}, where {most[worst]:.3g} is likely"
 
 
-def likely_mistake(elements: Tensor, expected: Tensor, std: Tensor, heading_deg: Tensor) -> str | None:
-    """Return the mistake that explains most of some readings, better than others and than iron; None without one.
+def likely_mistake(elements: Tensor, expected: Tensor, std: Tensor) -> str | None:
+    """Return the mistake that explains a reading better than others and than iron; None without one.
 
-    Iron is a constant vector in the vehicle's axes, whose standard deviation is :data:`IRON_NT`.
+    Iron explains any reading; its standard deviation along each axis of the vehicle is :data:`IRON_NT`.
 
     Args:
-        elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
-        expected: ``(N, 3)`` the elements at their places.
-        std: ``(..., 3)`` standard deviations of the difference.
-        heading_deg: ``(N,)`` headings.
+        elements: ``(3,)`` D [deg], I [deg], B_H [nT].
+        expected: ``(3,)`` the elements at its place.
+        std: ``(3,)`` standard deviations of the difference.
 
     Example:
-        >>> there = torch.tensor([[3.5, 73.0, 15000.0]]).double()
-        >>> read = torch.tensor([[3.4, -73.1, 14950.0]]).double()
-        >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]), torch.zeros(1).double())
+        >>> read, there = torch.tensor([3.4, -73.1, 14950.0]), torch.tensor([3.5, 73.0, 15000.0])
+        >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]))
         'it fits with -I: the vertical axis points up, and down is expected'
     """
-    iron, rest = _iron(elements, expected, heading_deg)
-    guesses = _mistakes(elements, expected, heading_deg) | {"": rest}
-    costs = {"": math.inf}
-    for text, read in guesses.items():
+    iron = (field_vector(elements) - field_vector(expected)) / IRON_NT
+    costs = {"": IRON_COST + iron.square().sum().item()}
+    for text, read in _mistakes(elements, expected).items():
         shares = element_difference(read, expected) / _most(expected, std)
-        if (shares.abs() <= 1).all(-1).double().mean() > 0.5:  # others may be spikes, whose squares are limited
-            costs[text] = MOST_SIGMAS**2 * shares.square().sum(-1).clamp_max(3.0).sum().item()
-    costs[""] += IRON_COST + (iron / IRON_NT).square().sum().item()
+        if (shares.abs() <= 1).all():
+            costs[text] = MOST_SIGMAS**2 * shares.square().sum().item()
     return min(costs, key=lambda text: costs[text]) or None
 
 
-def _iron(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the iron in the vehicle's axes [nT] that explains readings best, and the elements without it."""
-    cos, sin = torch.cos(torch.deg2rad(heading_deg)), torch.sin(torch.deg2rad(heading_deg))
-    none, read = torch.zeros_like(cos), field_vector(elements).unsqueeze(-1)
-    turn = torch.stack((cos, -sin, none, sin, cos, none, none, none, none + 1), -1).unflatten(-1, (3, 3))
-    iron = (turn.mT @ (read - field_vector(expected).unsqueeze(-1))).median(0).values
-    return iron, measured_elements((read - turn @ iron).squeeze(-1))
-
-
-def _mistakes(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> dict[str, Tensor]:
-    """Return what readings would be without each of the mistakes that engineers make."""
+def _mistakes(elements: Tensor, expected: Tensor) -> dict[str, Tensor]:
+    """Return what a reading would be without each of the mistakes that engineers make."""
     d, i, b = elements.unbind(-1)
     wrong = {
         "it fits with -I: the vertical axis points up, and down is expected": (d, -i, b),
@@ -115,7 +98,6 @@ def _mistakes(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> dict[s
         "it fits in radians, and degrees are expected": (d.rad2deg(), i.rad2deg(), b),
         "I fits in radians, and degrees are expected": (d, i.rad2deg(), b),
         "D fits in radians, and degrees are expected": (d.rad2deg(), i, b),
-        "the heading fits in radians, and degrees are expected": (d - heading_deg + heading_deg.rad2deg(), i, b),
         "D and I are swapped": (i, d, b),
         "it fits with D + 180: the horizontal axes point backward": (d + 180, i, b),
         "it fits with 90 - D: the horizontal axes are swapped": (90 - d, i, b),

@@ -34,7 +34,6 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking import Rules
 from magrl.tracking.network import load_pilot, pretrained, save_pilot
 from magrl.transforms import MagneticNorth, SensorErrors
-from magrl.vehicle.mistakes import likely_mistake
 from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
@@ -244,16 +243,6 @@ def test_a_first_reading_that_does_not_fit_the_start_is_refused(reading: Triple,
     with pytest.raises(ValueError, match=rf"^the first reading, .* does not fit the start, .*: .*{cause}"):
         vehicle.step(*reading, heading=0.0)
     assert vehicle.step(*here, heading=0.0).stop is None
-
-
-@pytest.mark.parametrize(("flipped", "cause"), [(2, None), (3, "the vertical axis points up")])
-def test_a_mistake_explains_most_readings(flipped: int, cause: str | None) -> None:
-    """Of four; the others are of no place."""
-    there = torch.tensor([HERE]).double().expand(4, 3)
-    read = torch.tensor([[60.0, 20.0, 30000.0], [-120.0, 35.0, 42000.0]] * 2).double()
-    read[:flipped] = there[:flipped] * torch.tensor([1.0, -1.0, 1.0])
-    found = likely_mistake(read, there, torch.tensor(NOISE), torch.zeros(4).double())
-    assert found is None if cause is None else cause in found
 
 
 def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:

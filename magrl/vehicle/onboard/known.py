@@ -136,14 +136,14 @@ def _check_measured(elements: Sequence[Triple], std: Sequence[Triple], error_nt:
     Raises:
         ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
     """
-    read, there = _f64(elements).unsqueeze(1)
+    read, there = _f64(elements)
     if magnetic:  # D is not measured
         read[..., 0] = there[..., 0]
     level, total = there[..., 2], field_vector(there).norm(dim=-1)
     shift = torch.stack((torch.rad2deg(error_nt / level), torch.rad2deg(error_nt / total), error_nt + 0 * level), -1)
-    most = torch.cat((shift, _f64(std))).norm(dim=0)
-    if text := deviation(read, there, most)[0]:
-        cause = likely_mistake(read, there, most, torch.zeros(1).double())
+    most = torch.cat((shift.unsqueeze(0), _f64(std))).norm(dim=0)
+    if text := deviation(read, there, most):
+        cause = likely_mistake(read, there, most)
         cause = cause or "check elements and place, or state a larger target_std"
         given, modeled = map(_text, elements)
         raise ValueError(f"target_elements {given} do not fit the target, {modeled} by the model ({text}): {cause}")
@@ -185,15 +185,15 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     """
     if reading.known is None or reading.known_std is None:
         return
-    read, there = reading.field.double().unsqueeze(0), reading.known.double().unsqueeze(0)
+    read, there = reading.field.double(), reading.known.double()
     std = torch.stack((reading.std.noise, reading.std.bias, reading.known_std.double())).norm(dim=0)
-    text = deviation(read, there, std)[0]
+    text = deviation(read, there, std)
     if text is None and tail >= LEAST_TAIL:
         return
-    cause = likely_mistake(read, there, std, torch.zeros(1).double()) if text else None
+    cause = likely_mistake(read, there, std) if text else None
     cause = cause or "check sensors, calibration, compass and place, state a larger error, or read again"
     text = text or f"p = {tail:.1g} by what is stated"
-    first, start = (_text(row[0].tolist()) for row in (read, there))
+    first, start = (_text(row.tolist()) for row in (read, there))
     raise ValueError(f"the first reading, {first}, does not fit the start, {start} ({text}): {cause}")
 
 
