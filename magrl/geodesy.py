@@ -49,8 +49,6 @@ def displaced(distance: Tensor, heading: Tensor, error: Tensor) -> Tensor:
         >>> displaced(torch.tensor(3.0), torch.tensor(0.0), torch.tensor([0.0, 4.0]))
         tensor([3., 4.])
     """
-    check_tensor(distance=distance, heading=heading)
-    check_tensor(2, error=error)
     return distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1) + error
 
 
@@ -64,7 +62,6 @@ def polar(displacement: Tensor) -> tuple[Tensor, Tensor]:
         >>> polar(torch.tensor([0.0, 4.0]))
         (tensor(4.), tensor(1.5708))
     """
-    check_tensor(2, displacement=displacement)
     north, east = displacement.unbind(-1)
     return torch.hypot(north, east), torch.atan2(east, north)
 
@@ -82,7 +79,6 @@ def wrap_angle(angle: Tensor) -> Tensor:
         >>> wrap_angle(torch.tensor([3.5 * math.pi, -math.pi])) / math.pi
         tensor([-0.5000,  1.0000])
     """
-    check_tensor(angle=angle)
     return _wrap(angle, math.pi)
 
 
@@ -132,7 +128,6 @@ def wrap_longitude(longitude: Tensor) -> Tensor:
         >>> wrap_longitude(torch.tensor([181.0, -180.0, 540.0]))
         tensor([-179.,  180.,  180.])
     """
-    check_tensor(longitude=longitude)
     return _wrap(longitude, 180.0)
 
 
@@ -149,7 +144,6 @@ def curvature_radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
         >>> [round(float(r), 3) for r in curvature_radii(torch.zeros((), dtype=torch.float64))]
         [6335.439, 6378.137]
     """
-    check_tensor(latitude=latitude)
     w2 = 1 - WGS84_E2 * torch.sin(torch.deg2rad(latitude)) ** 2
     prime_vertical = WGS84_A_KM / torch.sqrt(w2)
     return prime_vertical * (1 - WGS84_E2) / w2, prime_vertical
@@ -171,7 +165,6 @@ def local_frame(latitude: Tensor, longitude: Tensor) -> Tensor:
                 [-0.,  1.,  0.],
                 [-1., -0., -0.]])
     """
-    check_tensor(latitude=latitude, longitude=longitude)
     phi, lam = torch.deg2rad(latitude), torch.deg2rad(longitude)
     sp, cp, sl, cl = torch.sin(phi), torch.cos(phi), torch.sin(lam), torch.cos(lam)
     sp, cp, sl, cl = torch.broadcast_tensors(sp, cp, sl, cl)
@@ -194,9 +187,6 @@ def to_ecef(latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float = 0
         >>> to_ecef(torch.tensor(0.0), torch.tensor(90.0)).round()
         tensor([  -0., 6378.,    0.])
     """
-    check_tensor(latitude=latitude, longitude=longitude)
-    if isinstance(altitude_km, Tensor):
-        check_tensor(altitude_km=altitude_km)
     phi, lam = torch.deg2rad(latitude), torch.deg2rad(longitude)
     _, prime_vertical = curvature_radii(latitude)
     horizontal = (prime_vertical + altitude_km) * torch.cos(phi)
@@ -240,7 +230,6 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
         >>> round(float(lat), 4), round(float(lon), 4)
         (0.0, -179.6508)
     """
-    check_tensor(latitude=latitude, longitude=longitude, heading=heading, distance_km=distance_km)
     sin, cos = torch.sin(heading), torch.cos(heading)
     phi = torch.deg2rad(latitude)
     sin_phi, cos_phi = torch.sin(phi), torch.cos(phi)
@@ -299,7 +288,6 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
         (699.56, 161.594)
     """
     inputs = (latitude1, longitude1, latitude2, longitude2)
-    check_tensor(latitude1=latitude1, longitude1=longitude1, latitude2=latitude2, longitude2=longitude2)
     for latitude in (latitude1, latitude2):
         require(~(latitude.abs() > 90), latitude, "latitude {} is not between -90 and 90 degrees")
     lat1, lon1, lat2, lon2 = (torch.deg2rad(x.double()) for x in torch.broadcast_tensors(*inputs))

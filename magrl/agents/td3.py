@@ -19,7 +19,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_number, check_type
 
 
 class Networks(NamedTuple):
@@ -197,7 +197,6 @@ def saturation_penalty(logits: Tensor) -> Tensor:
         >>> saturation_penalty(torch.tensor([[1.0, -3.0]]))
         tensor(5.)
     """
-    check_tensor(logits=logits)
     return logits.square().mean()
 
 

@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor
 from magrl.geodesy import geodesic
 
 
@@ -24,9 +23,6 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
         ``(...)`` in [0, 1]: 0 for a failure, 1 for a success on a path no longer than the shortest, also where both are
         0.
 
-    Raises:
-        TypeError: for lengths that are not real tensors.
-
     Source:
         P. Anderson et al., On evaluation of embodied navigation agents, arXiv 1807.06757 (2018).
 
@@ -34,7 +30,6 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
         >>> spl(torch.tensor([True, True, False]), torch.full((3,), 400.0), torch.tensor([500.0, 390.0, 500.0]))
         tensor([0.8000, 1.0000, 0.0000])
     """
-    check_tensor(shortest_km=shortest_km, length_km=length_km)
     longer_km = torch.maximum(length_km, shortest_km)
     return success * torch.where(longer_km == 0, 1.0, shortest_km / longer_km)
 
@@ -56,7 +51,6 @@ def path_efficiency(straight_km: Tensor, length_km: Tensor) -> Tensor:
         >>> path_efficiency(torch.tensor([300.0, 0.0]), torch.tensor([400.0, 0.0]))
         tensor([0.7500,    nan])
     """
-    check_tensor(straight_km=straight_km, length_km=length_km)
     efficiency = straight_km / torch.maximum(straight_km, length_km)  # legs are geodesics only within millimeters
     return torch.where(length_km == 0, math.nan, efficiency)
 
@@ -75,16 +69,12 @@ def path_measures(success: Tensor, start: Tensor, end: Tensor, target: Tensor, l
         Tensors ``(...)``: ``shortest_km``, the geodesic distance from start to destination; ``length_km``;
         ``navigation_error_km``, the distance left at the end; ``spl`` and ``path_efficiency`` in [0, 1].
 
-    Raises:
-        ValueError: for positions of another shape.
-
     Example:
         >>> start, end = torch.tensor([[-2.0, 162.0]]).double(), torch.tensor([[-3.0, 162.0]]).double()
         >>> path = path_measures(torch.tensor([True]), start, end, end, torch.tensor([221.15]).double())
         >>> {name: round(value.item(), 2) for name, value in path.items()}
         {'shortest_km': 110.58, 'length_km': 221.15, 'navigation_error_km': 0.0, 'spl': 0.5, 'path_efficiency': 0.5}
     """
-    check_tensor(2, start=start, end=end, target=target)
     shortest_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
     error_km, _ = geodesic(*end.unbind(-1), *target.unbind(-1))
     straight_km, _ = geodesic(*start.unbind(-1), *end.unbind(-1))

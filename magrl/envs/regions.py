@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from magrl import paper
-from magrl.checks import check_number, check_numbers, check_tensor, check_type
+from magrl.checks import check_number, check_numbers, check_type
 from magrl.field.bank import FieldBank, check_index, checked_boxes
 from magrl.field.model import Float64Module
 from magrl.geodesy import MEAN_RADIUS_KM, check_box, geodesic, wrap_longitude
@@ -56,7 +56,6 @@ class Region:
             >>> Region((-10, 0), (170, 190)).unwrapped(torch.tensor([-5.0, -175.0]))
             tensor([ -5., 185.])
         """
-        check_tensor(2, position=position)
         middle = sum(self.longitude) / 2
         latitude, longitude = position.unbind(-1)
         return torch.stack((latitude, middle + wrap_longitude(longitude - middle)), -1)
@@ -74,7 +73,6 @@ class Region:
             >>> Region((-10, 0), (160, 170)).holding(torch.tensor([[-12.0, 165.0]]))
             Region(latitude=(-12.0, 0.0), longitude=(160.0, 170.0))
         """
-        check_tensor(2, position=position)
         low, high = (end(position.reshape(-1, 2), 0).tolist() for end in (torch.amin, torch.amax))
         (south, north), (west, east) = self.latitude, self.longitude
         return Region((min(south, low[0]), max(north, high[0])), (min(west, low[1]), max(east, high[1])))
@@ -179,7 +177,6 @@ class Regions(Float64Module):
             tensor([[False],
                     [ True]])
         """
-        check_tensor(2, position=position)
         check_index(torch.as_tensor(index), len(self))
         (south, north), (west, east) = self.latitude[index].unbind(-1), self.longitude[index].unbind(-1)
         latitude, longitude = position.unbind(-1)

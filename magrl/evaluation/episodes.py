@@ -31,7 +31,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_number, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.measures import path_measures
 from magrl.evaluation.arrays import ArrayPolicy
@@ -411,7 +411,6 @@ def bootstrap_interval(values: Tensor, resamples: int = 1000, seed: int = 0) -> 
         >>> bootstrap_interval(torch.ones(10))
         (1.0, 1.0)
     """
-    check_tensor(values=values)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"values must be of shape (M,) with M >= 1, got {tuple(values.shape)}")
     generator = torch.Generator().manual_seed(seed)
@@ -440,7 +439,6 @@ def interquartile_mean(values: Tensor) -> Tensor:
         >>> interquartile_mean(torch.tensor([0.0, 97.0, 98.0, 99.0, 100.0])).item()
         98.0
     """
-    check_tensor(values=values)
     if values.ndim < 1 or not values.shape[-1]:
         raise ValueError(f"values must be of shape (..., R) with R >= 1, got {tuple(values.shape)}")
     count = values.shape[-1]
@@ -477,7 +475,6 @@ def stratified_bootstrap(strata: Sequence[Tensor], resamples: int = 10_000, seed
         >>> stratified_bootstrap([torch.full((5,), 99.0), torch.full((3,), 99.0)])
         (99.0, 99.0)
     """
-    check_tensor(**{f"stratum {index}": scores for index, scores in enumerate(strata)})
     shapes = [tuple(scores.shape) for scores in strata]
     if not strata or any(len(shape) != 1 or not shape[0] for shape in shapes):
         raise ValueError(f"strata must each be of shape (R,) with R >= 1, got {shapes}")

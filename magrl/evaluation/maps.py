@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
 from magrl.envs import Region, Regions
 from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
@@ -68,7 +68,6 @@ def shortest_path(start: Tensor, target: Tensor, points: int = 41) -> Tensor:
         >>> shortest_path(torch.tensor([50.0, 0.0]), torch.tensor([50.0, 90.0]), points=3)[1].round(decimals=2)
         tensor([59.3400, 45.0000], dtype=torch.float64)
     """
-    check_tensor(2, start=start, target=target)
     check_number(2, whole=True, points=points)
     path, target = [start.double()], target.double()
     for left in range(points - 1, 1, -1):

@@ -10,8 +10,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor
-
 NAMES = ("D", "I", "B_H")
 """Elements that a vehicle measures, in the order of every ``field`` tensor."""
 UNITS = ("deg", "deg", "nT")
@@ -51,7 +49,6 @@ def measured_elements(b_ned: Tensor) -> Tensor:
         >>> measured_elements(torch.tensor([30000.0, 0.0, 0.0]))
         tensor([    0.,     0., 30000.])
     """
-    check_tensor(3, b_ned=b_ned)
     north, east, down = b_ned.unbind(-1)
     horizontal = torch.hypot(north, east)
     # Adding zero removes the sign of a zero.
@@ -73,7 +70,6 @@ def element_difference(elements: Tensor, others: Tensor) -> Tensor:
         >>> element_difference(torch.tensor([179.0, 10.0, 30000.0]), torch.tensor([-179.0, 9.0, 29000.0]))
         tensor([  -2.,    1., 1000.])
     """
-    check_tensor(elements=elements, others=others)
     difference = elements - others
     declination = difference[..., 0]
     declination -= 360 * torch.round(declination / 360)  # a view: the difference changes with it
@@ -93,7 +89,6 @@ def field_vector(elements: Tensor) -> Tensor:
         >>> field_vector(torch.tensor([90.0, 0.0, 30000.0])).round()
         tensor([   -0., 30000.,     0.])
     """
-    check_tensor(3, elements=elements)
     declination, inclination = torch.deg2rad(elements[..., :2]).unbind(-1)
     horizontal = elements[..., 2]
     return torch.stack(
@@ -116,7 +111,6 @@ def elements_jacobian(b_ned: Tensor) -> Tensor:
         >>> elements_jacobian(torch.tensor([100.0, 0.0, 0.0]))[0, 1].deg2rad()  # D turns by 1/B_H per nT eastward
         tensor(0.0100)
     """
-    check_tensor(3, b_ned=b_ned)
     north, east, down = b_ned.unbind(-1)
     horizontal2 = north * north + east * east
     horizontal = torch.sqrt(horizontal2)
@@ -146,7 +140,6 @@ def elements_gradient(b_ned: Tensor, b_gradient: Tensor) -> Tensor:
         >>> elements_gradient(torch.ones(3), torch.zeros(3, 2)).shape
         torch.Size([3, 2])
     """
-    check_tensor(3, 2, b_gradient=b_gradient)
     return elements_jacobian(b_ned) @ b_gradient
 
 
@@ -163,7 +156,6 @@ def rotation(attitude_deg: Tensor) -> Tensor:
         >>> (rotation(torch.tensor([0.0, 0.0, 90.0])) @ torch.tensor([1.0, 0.0, 0.0])).round()  # forward is east
         tensor([-0., 1., 0.])
     """
-    check_tensor(3, attitude_deg=attitude_deg)
     (sr, sp, sh), (cr, cp, ch) = (f(torch.deg2rad(attitude_deg)).unbind(-1) for f in (torch.sin, torch.cos))
     north = cp * ch, sr * sp * ch - cr * sh, cr * sp * ch + sr * sh
     east = cp * sh, sr * sp * sh + cr * ch, cr * sp * sh - sr * ch
@@ -183,7 +175,6 @@ def elements_of_axes(axes_nt: Tensor, attitude_deg: Tensor) -> Tensor:
         >>> elements_of_axes(torch.tensor([0.0, -20000.0, 40000.0]), torch.tensor([0.0, 0.0, 90.0])).round()
         tensor([    0.,    63., 20000.])
     """
-    check_tensor(3, axes_nt=axes_nt)
     return measured_elements((rotation(attitude_deg) @ axes_nt.unsqueeze(-1)).squeeze(-1))
 
 

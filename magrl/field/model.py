@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Protocol, Self
 import torch
 from torch import Tensor, nn
 
-from magrl.checks import check_tensor
 from magrl.field.elements import elements_gradient, measured_elements
 
 
@@ -103,7 +102,6 @@ def elements_at(field: Any, position: Tensor, index: Tensor | None = None) -> Te
         >>> [round(x, 2) for x in elements_at(paper, torch.tensor([-2.0, 162.0])).tolist()]
         [8.02, -16.15, 35466.61]
     """
-    check_tensor(2, position=position)
     return measured_elements(field(*_place(field, position, index)))
 
 
@@ -146,7 +144,6 @@ def elements_gradient_at(field: Any, position: Tensor, index: Tensor | None = No
                 [ 0.0173,  0.0030],
                 [ 0.1423, -0.4990]], dtype=torch.float64)
     """
-    check_tensor(2, position=position)
     return elements_gradient(*field.value_and_gradient(*_place(field, position, index)))
 
 

@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_numbers, check_tensor, check_type
+from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
 from magrl.field.model import FieldModel, elements_gradient_at
@@ -77,7 +77,6 @@ def first_track(reading: Tensor, prior: GradientPrior, sensor_std: Tensor) -> Fi
         >>> first_track(torch.tensor([8.0, -16.0, 35000.0]), prior, torch.ones(3)).covariance.shape
         torch.Size([3, 3, 3])
     """
-    check_tensor(2, gradient=prior.gradient)
     gradient = prior.gradient.expand(*reading.shape, 2).to(reading)
     variance = torch.cat((_std(reading, sensor_std).unsqueeze(-1), prior.std.expand_as(gradient).to(reading)), -1)
     return FieldTrack(torch.cat((reading.unsqueeze(-1), gradient), -1), torch.diag_embed(variance.square()))
@@ -105,7 +104,6 @@ def next_track(
         >>> next_track(track, leg, torch.tensor([2.0]), none, none, none).mean  # as expected
         tensor([[2., 1., 0.]])
     """
-    check_tensor(2, leg=leg)
     leg = leg.unsqueeze(-2).to(track.mean)
     step = torch.eye(3).to(leg).expand(*leg.shape[:-1], 3, 3).clone()
     step[..., 0, 1:] = leg
@@ -485,7 +483,6 @@ class MeanJacobian(QuasiNewton):
         super().__init__(max_leg_km, max_turn_rad, **options)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
-        check_tensor(2, position=position)
         if position.numel() < 4:
             raise ValueError(f"position must hold at least two places (..., 2), got shape {tuple(position.shape)}")
         gradients = elements_gradient_at(field, position.reshape(-1, 2).double())

@@ -31,7 +31,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from magrl.checks import check_tensor
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.geodesy import move_place
 from magrl.sensor_std import PERFECT, SensorStd
@@ -174,7 +173,6 @@ def before(near: Tensor, errors: SensorStd, model: EarthModel | None = None) -> 
         >>> before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT).mean.shape
         torch.Size([28])
     """
-    check_tensor(3, near=near)
     near, magnetic = near.double(), torch.as_tensor(errors.bias)[..., 0].isinf().expand(near.shape[:-1])
     mean, covariance = expected(field_vector(near), latitude_cells() if model is None else model.cells())
     if torch.compiler.is_compiling() or magnetic.any():  # its table is large
@@ -367,7 +365,6 @@ def innovation(
         >>> innovation(belief, reading, std).residual.round(decimals=1)
         tensor([0.5000, -0.0000, 0.7000], dtype=torch.float64)
     """
-    check_tensor(3, reading=reading, sensor_std=sensor_std)
     return predicted(belief, reading, sensor_std < math.inf, heading, errors).noisy(sensor_std)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
 from magrl.tracking.destination import Destination, unit_points
@@ -149,7 +149,6 @@ def approach(
         >>> approach(torch.tensor([0.0, 8.0]), torch.tensor([0.0]), torch.tensor([10.0]), 50.0, 3.0).round(decimals=2)
         tensor([0.0000, 1.5700])
     """
-    check_tensor(2, displacement=displacement)
     north, east = displacement.split(1, -1)
     turn = wrap_angle(torch.atan2(east, north) - heading)
     limit = torch.as_tensor(max_turn_rad, dtype=displacement.dtype, device=displacement.device)

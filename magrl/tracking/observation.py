@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor
 from magrl.sensor_std import OUTAGE_STD
 
 OBSERVATION_SIZE = 19
@@ -67,8 +66,6 @@ def track_observation(
         >>> track_observation(**seen, time=one, price=one)[:2]
         tensor([0.6000, 0.8000])
     """
-    check_tensor(2, aim=aim, plan=plan)
-    check_tensor(2, 2, covariance=covariance)
     length = aim.norm(dim=-1, keepdim=True)
     ellipse = (weights[..., None, None] * gradient.unsqueeze(-1) * gradient.unsqueeze(-2)).sum(-3)
     objective = (weights * remaining.square()).sum(-1, keepdim=True)

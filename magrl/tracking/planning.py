@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor
 from magrl.sensor_std import SensorStd
 from magrl.tracking.destination import Destination
 from magrl.tracking.displacement import DestinationPosterior
@@ -55,7 +54,6 @@ def sensor_length(std: Tensor) -> Tensor:
         >>> sensor_length(torch.tensor([0.04, 0.03, 0.4]))
         tensor(2.)
     """
-    check_tensor(3, std=std)
     return (std / std.new_tensor(SLOPES)).sort(-1).values[..., 1]
 
 
@@ -142,7 +140,6 @@ def planned_leg(
         >>> planned_leg(goal, there, there.displacement().mean, errors, torch.tensor(1.0), max_leg_km=50.0).shape
         torch.Size([2])
     """
-    check_tensor(2, aim=aim)
     aim = aim.to(goal.field)
     legs = _legs(aim, lengths, max_leg_km)
     left = aim.unsqueeze(-2) - legs
@@ -170,7 +167,6 @@ def corrected(displacement: Tensor, correction: Tensor) -> Tensor:
         >>> corrected(torch.tensor([20.0, 0.0]), torch.tensor([2.0, 3.0])).round()  # e times as far, to the right
         tensor([ 4., 54.])
     """
-    check_tensor(2, displacement=displacement, correction=correction)
     stretch, angle = (CORRECTION * correction).unbind(-1)
     (x, y), cos, sin = displacement.unbind(-1), torch.cos(angle), torch.sin(angle)
     return torch.exp(stretch).unsqueeze(-1) * torch.stack((cos * x - sin * y, sin * x + cos * y), -1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magrl import guidance
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
 from magrl.tracking.displacement import Displacement
 
 VISITED = 24
@@ -40,9 +40,6 @@ def unvisited(displacement: Displacement, visited: Tensor, ellipse: Tensor) -> T
     Returns:
         ``(..., 2)`` [km].
 
-    Raises:
-        ValueError: for shapes that do not match.
-
     Source:
         L. D. Stone, Theory of Optimal Search, Academic Press (1975): the posterior of a target after unsuccessful
         search.
@@ -56,8 +53,6 @@ def unvisited(displacement: Displacement, visited: Tensor, ellipse: Tensor) -> T
         >>> bool(unvisited(displacement, torch.zeros(1, 2), ellipse)[1].abs() > 20)
         True
     """
-    check_tensor(2, displacement=displacement.mean, visited=visited)
-    check_tensor(2, 2, covariance=displacement.covariance, ellipse=ellipse)
     samples = _SAMPLES.to(displacement.mean)
     candidates = displacement.mean.unsqueeze(-2) + samples @ _root(displacement.covariance).mT
     axes = _root(ellipse, _LEAST_ELLIPSE)  # in these axes, the ellipse is a circle of radius 1
@@ -92,15 +87,11 @@ def visit(visited: Tensor, leg: Tensor) -> Tensor:
         visited: ``(..., K, 2)`` displacements to the visited places before the leg [km].
         leg: ``(..., 2)`` northward and eastward [km].
 
-    Raises:
-        ValueError: for shapes that do not match.
-
     Example:
         >>> visit(torch.tensor([[1.0, 0.0], [2.0, 0.0]]), torch.tensor([0.0, 3.0]))
         tensor([[ 0.,  0.],
                 [ 1., -3.]])
     """
-    check_tensor(2, visited=visited, leg=leg)
     stayed = (leg.norm(dim=-1) < _STAYED_KM)[..., None, None]
     before = torch.where(stayed, visited[..., 1:, :], visited[..., :-1, :]) - leg.unsqueeze(-2)
     return torch.cat((torch.zeros_like(leg).unsqueeze(-2), before), -2)
@@ -139,15 +130,11 @@ def arrival_ellipse(gradient: Tensor, covariance: Tensor, weights: Tensor, radiu
         weights: ``(..., E)`` from :func:`arrival_weights`.
         radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
 
-    Raises:
-        ValueError: for shapes that do not match.
-
     Example:
         >>> arrival_ellipse(torch.tensor([[0.02, 0.0]]), torch.zeros(1, 2, 2), torch.tensor([100.0]))
         tensor([[0.0400, 0.0000],
                 [0.0000, 0.0000]])
     """
-    check_tensor(gradient.shape[-2], weights=weights)
     squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + covariance
     if radius_km is not None:
         return (torch.eye(2) / radius_km**2).to(squares).expand(*squares.shape[:-3], 2, 2)

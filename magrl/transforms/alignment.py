@@ -13,7 +13,7 @@ from torch.func import jacfwd, vmap
 from torchrl.data import Binary, Bounded, Composite
 
 from magrl import guidance
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
 from magrl.field import FieldBank
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
@@ -75,7 +75,6 @@ class FieldGradient(ObservationTransform):
         if self.elements:
             index = region[0].squeeze(-1) if region else None
             return [elements_gradient_at(self.field, position, index).to(torch.get_default_dtype())]
-        check_tensor(2, position=position)
         gradient = vmap(jacfwd(self.field))(position.reshape(-1, 2))
         if gradient.ndim != 3:
             raise ValueError(f"field must turn a position (2,) into values (E,), got {tuple(gradient.shape[1:-1])}")

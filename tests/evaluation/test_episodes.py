@@ -212,11 +212,6 @@ def test_spl_by_hand() -> None:
     got = spl(success, torch.tensor([300.0, 300.0, 300.0, 100.0]), torch.tensor([400.0, 290.0, 300.0, 0.0]))
     assert got.tolist() == [0.75, 1.0, 0.0, 1.0]
     assert path_efficiency(torch.tensor([50.1, 10.0]), torch.tensor([50.0, 40.0])).tolist() == [1.0, 0.25]
-    for measure in (partial(spl, success), path_efficiency):
-        with pytest.raises(TypeError, match=r"^length_km must be a tensor"):
-            measure(torch.ones(4), 5)
-        with pytest.raises(TypeError, match="_km must be a tensor"):
-            measure(5, torch.ones(4))
 
 
 def test_path_measures_take_any_batch() -> None:
@@ -226,11 +221,6 @@ def test_path_measures_take_any_batch() -> None:
     expected = {"shortest_km": 110.5744, "navigation_error_km": 0, "spl": 0.5, "path_efficiency": 0.5}
     for key, value in expected.items():
         torch.testing.assert_close(got[key].double(), torch.full((3, 1), value).double(), atol=1e-4, rtol=0)
-    for index, name in enumerate(("start", "end", "target")):
-        places = [start, end, end]
-        places[index] = torch.zeros(1, 3)
-        with pytest.raises(ValueError, match=rf"^{name} must have the shape \(..., 2\)"):
-            path_measures(torch.tensor([True]), *places, torch.ones(1))
 
 
 def test_summary_by_hand() -> None:

@@ -47,9 +47,6 @@ def test_differences_in_declination_are_wrapped_and_others_are_not_rounded():
     torch.testing.assert_close(turned, here.double() - there.double())
     assert element_difference(f64(350.0, 200.0, 200.0), f64(0.0, 0.0, 0.0)).tolist() == [-10.0, 200.0, 200.0]
     assert element_difference(f64(180.25, 0.0, 0.0), f64(0.0, 0.0, 0.0))[0] == -179.75
-    for name, values in {"elements": (5, f64(1.0)), "others": (f64(1.0), 5)}.items():
-        with pytest.raises(TypeError, match=f"^{name} must be a tensor"):
-            element_difference(*values)
 
 
 def test_round_trip():
@@ -95,11 +92,3 @@ def test_nan_in_a_component_is_nan_in_what_depends_on_it():
         assert (jacobian[[0, 2], :2].isnan() == horizontal).all()
     assert field_vector(f64(0.0, 0.0, math.nan)).isnan().all()
     assert elements_gradient(f64(1.0, 1.0, 1.0), torch.full((3, 2), math.nan, dtype=torch.float64)).isnan().all()
-
-
-@pytest.mark.parametrize("function", [measured_elements, elements_jacobian, field_vector])
-def test_vectors_of_another_size_raise(function) -> None:
-    with pytest.raises(ValueError, match=r"must have the shape \(\.\.\., 3\), got \(2,\)"):
-        function(torch.zeros(2))
-    with pytest.raises(ValueError, match=r"b_gradient must have the shape \(\.\.\., 3, 2\), got \(2, 2\)"):
-        elements_gradient(torch.ones(3), torch.zeros(2, 2))

@@ -169,21 +169,3 @@ def test_the_best_pair_crosses_nearest_to_a_right_angle():
             gradient = f64(1.0, 0.0, 1.0, 1.0, 1.0, 2.0).reshape(3, 2)
             gradient[missing] = bad
             assert best_pair(gradient).tolist() == expected
-
-
-WRONG = {
-    "field": (parallel_approach, (3,), (2,), (2, 2)),
-    "target_field": (parallel_approach, (2,), (3,), (2, 2)),
-    "gradient": (parallel_approach, (2,), (2,), (3, 2)),
-    r"gradient .*\(1, 2\)": (best_pair, (1, 2)),
-    r"gradient .*\(3, 3\)": (best_pair, (3, 3)),
-    r"same elements, got field \(2, 1\)": (objective, (2, 1), (2, 3), (2, 3)),
-    r"same elements, .* floors \(\)": (objective_weights, (2, 3), (2, 3), ()),
-}
-
-
-@pytest.mark.parametrize("message", WRONG)
-def test_a_wrong_size_is_named(message):
-    call, *shapes = WRONG[message]
-    with pytest.raises(ValueError, match=message):
-        call(*map(torch.ones, shapes))

@@ -1,5 +1,7 @@
 """Wrong arguments of public functions and classes raise an error that names them.
 
+The mathematics of tensors, in ``geodesy`` and ``guidance``, has no checks: who calls it has made its tensors.
+
 Driven by signatures: every function and class whose required arguments have a value in VALUES is called with a wrong
 value for each of its arguments that is a tensor, a number, or some numbers: of another type, or out of all ranges.
 """
@@ -17,14 +19,8 @@ from support.public_names import public_members
 
 from magrl.field import IGRF
 
-HOMES = ("geodesy", "guidance", "field", "transforms", "envs", "navigators")
-PLACES = torch.zeros(4)
+HOMES = ("field", "transforms", "envs", "navigators")
 VALUES: dict[str, Any] = {
-    **dict.fromkeys(("latitude", "longitude", "latitude1", "longitude1", "latitude2", "longitude2"), PLACES),
-    **dict.fromkeys(("heading", "distance", "distance_km", "angle", "reference", "proximity", "step"), PLACES),
-    **dict.fromkeys(("objective_before", "objective_after"), PLACES),
-    **dict.fromkeys(("field", "target_field", "weights", "floors"), torch.ones(4, 2)),
-    **dict.fromkeys(("displacement", "error"), torch.zeros(4, 2)),
     **dict.fromkeys(("radius_km", "max_leg_km", "speed_km_h"), 25.0),
     **dict.fromkeys(("max_turn_rad", "cost"), 1.5),
     "field_low": (0.0, 0.0, 0.0),
@@ -33,7 +29,6 @@ VALUES: dict[str, Any] = {
     "name": "marine",
     "uniform": torch.zeros(12),
     "num_tasks": 2,
-    "gradient": torch.eye(2),
     "gauss": torch.ones(2, 2, dtype=torch.complex128),
     "date": "2026-07-01",
     "weight": 1.0,
@@ -95,4 +90,4 @@ def test_wrong_arguments_raise(member: Any, good: dict[str, Any], parameter: ins
 
 
 def test_there_are_cases() -> None:
-    assert len(list(cases())) > 140
+    assert len(list(cases())) > 100

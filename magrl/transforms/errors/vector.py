@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from magrl.checks import check_tensor
 from magrl.field.elements import rotation
 from magrl.transforms.errors.base import check_sizes
 
@@ -79,7 +78,6 @@ class VectorErrors:
         Returns:
             ``(..., 12)``.
         """
-        check_tensor(self.draws, normal=normal)
         sizes = (*self.hard_iron_nt, *(x for row in self.soft_iron for x in row), *self.attitude_deg)
         drawn = normal.new_tensor(sizes) * (torch.ones_like(normal) if self.fixed else normal)
         hard, soft, attitude = drawn.split((3, 9, 2), -1)
@@ -98,7 +96,6 @@ class VectorErrors:
         Returns:
             ``(..., 3)``.
         """
-        check_tensor(3, elements=elements)
         declination, inclination, horizontal = elements.unbind(-1)
         bearing = torch.deg2rad(declination) - heading.squeeze(-1)  # of magnetic north from the bow
         cos, sin, tan = torch.cos(bearing), torch.sin(bearing), torch.tan(torch.deg2rad(inclination))
@@ -119,7 +116,6 @@ class VectorErrors:
         Returns:
             ``(..., 3)`` [deg^2, deg^2, nT^2].
         """
-        check_tensor(3, elements=elements)
         hard, soft, attitude = self._mean_squares
         tan2, horizontal2 = torch.tan(torch.deg2rad(elements[..., 1])).square(), elements[..., 2].square()
         total2 = horizontal2 * (1 + tan2)
