@@ -1,0 +1,64 @@
+"""The example that replays a table: what it says of right ones and of wrong ones."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from support.recipes import ROOT, load
+
+LOG = ROOT / "docs/examples/log.csv"
+PLACES = {"latitude": "longitude", "longitude": "latitude"}
+
+
+@pytest.fixture
+def replayed(tmp_path: Path, monkeypatch, capsys):
+    """Return a function that replays a changed table, and returns what is printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(change) -> str:
+        change(pd.read_csv(LOG)).to_csv("table.csv", index=False)
+        load("docs/examples/replay").replay("table.csv", "2025-01-01")
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_the_ship_arrives_and_its_picture_is_drawn(replayed, tmp_path: Path) -> None:
+    lines = replayed(lambda table: table).splitlines()
+    assert [line.partition(":")[0] for line in lines] == [f"row {number}" for number in range(25)]
+    assert lines[-1].endswith("stop arrived")
+    assert (tmp_path / "replay.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.assign(I=-table.I), "25 of 25 readings do not fit IGRF: it fits with -I"),
+        (lambda table: table.assign(B_H=table.B_H / 1000), "B_H looks like microtesla"),
+        (lambda table: table.rename(columns=PLACES), "latitude and longitude are swapped"),
+        (lambda table: table.assign(distance=1000 * table.distance), "distance in row 1 must be at most 100, got 2"),
+        (lambda table: table.replace({"D": {table.D[3]: 99999}}), "D in row 3 must be at most 180, got 99999"),
+        (lambda table: table.replace({"heading": {290.0: None}}), "heading in row 0 must be at most 360, got nan"),
+        (lambda table: table.rename(columns={"distance": "dist_miles"}), "heading, dist_miles"),
+        (lambda table: table.assign(b_h=table.B_H), "longitude, b_h"),
+        (lambda table: table.head(1), "two or more rows"),
+    ],
+)
+def test_a_wrong_table_is_refused(replayed, change, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replayed(change)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda table: table.assign(distance=table.distance / 1.852), "row 1: a distance of 10.8 km, and 20 km"),
+        (lambda table: table.drop(index=5), "row 5: a distance of 20 km, and 40 km"),
+        (
+            lambda table: table.replace({"B_H": {table.B_H[3]: 900 + table.B_H[3]}}),
+            "one reading does not fit IGRF",
+        ),
+    ],
+)
+def test_a_doubtful_row_is_named(replayed, change, line: str) -> None:
+    assert line in replayed(change)
