@@ -16,7 +16,7 @@ import pytest
 import td3_gradient_guided as recipe
 import torch
 from support.paths import with_paths
-from support.recipes import ROOT, load, small
+from support.recipes import ROOT, small
 from tensordict import TensorDict
 
 from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, load_policy, paper, planet_scenario
@@ -85,13 +85,6 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     env = policy_env(GeomagneticNavEnv(num_envs=3, seed=0), policy)
     assert env.rollout(2, policy)["action"].isfinite().all()
     assert all(weight.isfinite().all() for weight in weights.values())
-
-
-@pytest.mark.usefixtures("without_figures")
-def test_ppo_among_the_examples_trains(tmp_path: Path) -> None:
-    ppo = load("docs/examples/ppo")
-    assert ppo.train(small(ppo, tmp_path / "run", total_frames=64))["updates"] == 2
-    assert evaluate(str(tmp_path / "run" / "policy.safetensors"), "figure-4-1", max_steps=2).shape == (1,)
 
 
 def test_a_task_takes_its_preset_unless_another_is_given() -> None:
@@ -251,7 +244,7 @@ def names_read(tree: ast.Module) -> set[str]:
     return texts | {f"final_{x}" for x in texts} | {x.attr for x in attributes if ast.unparse(x.value) in own}
 
 
-@pytest.mark.parametrize("module", [*RECIPES, load("docs/examples/ppo")], ids=names)
+@pytest.mark.parametrize("module", RECIPES, ids=names)
 def test_every_setting_is_read(module) -> None:
     """By the recipe or its run; what a validator alone reads is offered in vain."""
     sources = [Path(module.__file__), *SHARED]
