@@ -52,8 +52,6 @@ RECIPE = "evaluate.py"
 SHOWN = 24
 """Number of tasks in trajectories.png."""
 Pair = tuple[TensorDictModuleBase, ...]
-MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
-MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency")
 
 
 def free_folder() -> Path:
@@ -181,9 +179,7 @@ def evaluate(config: Config) -> str:
         number = len(results.summaries.setdefault(kind, []))
         results.summaries[kind].append(summary)
         results.runs.append({"navigator": name, "run": number, "source": run, **summary})
-        columns = {
-            key: measured[key].tolist() for key in (*MEASURES, "false_arrival", "not_declared") if key in measured
-        }
+        columns = {key: values.tolist() for key, values in measured.items()}
         results.episodes += [
             {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
             for task in range(flight.base.num_envs)

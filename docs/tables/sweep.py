@@ -34,9 +34,9 @@ from flights import write_picture
 from magrl import score
 from magrl.checks import check_choice
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
+from magrl.envs.measures import interquartile_mean, stratified_bootstrap
 from magrl.envs.navigation import task_name
 from magrl.envs.sb3 import BatchedVecEnv
-from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
 from magrl.registry import NAMED_TASKS

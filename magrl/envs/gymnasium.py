@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
 
-from magrl.envs.measures import path_measures
+from magrl.envs.measures import Episode, measured
 from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.envs.specs import PUBLIC_KEYS
 from magrl.transforms.areas import outlines
@@ -290,15 +290,11 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]:
-    """Return the measures of episodes from their last states, named as in ``magrl.evaluation.episode_measures``."""
-    success = end["success"].squeeze(-1)
-    measures = {
-        "success": success,
-        "is_success": success,  # the name that stable-baselines3 and Gymnasium-Robotics read
-        "steps": end["elapsed_steps"].squeeze(-1),
-        **({"false_arrival": end["declared"].squeeze(-1) & ~success} if "declared" in end.keys() else {}),  # noqa: SIM118
-        **path_measures(success, end["start_position"], end["position"], end["target_position"], length_km),
-    }
+    """Return the measures of episodes from their last states."""
+    flags = {key: end[key].squeeze(-1) for key in ("success", "declared", "truncated") if key in end.keys()}  # noqa: SIM118
+    places = {key: end[f"{key}_position"] for key in ("start", "target")} | {"end": end["position"]}
+    measures = measured(Episode(steps=end["elapsed_steps"].squeeze(-1), length_km=length_km, **places, **flags))
+    measures["is_success"] = measures["success"]  # the name that stable-baselines3 and Gymnasium-Robotics read
     return {name: _array(value) for name, value in measures.items()}
 
 

@@ -17,9 +17,10 @@ from torch import nn
 from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_number, short
+from magrl.envs.measures import summarize
 from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.arrays import ArrayPolicy
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns, summarize
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
 from magrl.evaluation.navigators import make_navigator, named
 from magrl.navigators import Navigator
 

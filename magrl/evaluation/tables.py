@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 
 from magrl import paper
-from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
+from magrl.envs.measures import MEASURES, interquartile_mean, stratified_bootstrap
 from magrl.evaluation.navigators import KINDS, Agent, Kind
 
 Summary = Mapping[str, float | None]
@@ -25,23 +25,8 @@ Summaries = Mapping[Kind | str, Sequence[Summary]]
 MIN_RUNS = 10
 """Minimum number of runs for a bootstrap interval whose coverage is about nominal."""
 
-COLUMNS = {
-    "SR %": ("success_rate", ".1f"),
-    "TL m": ("trajectory_length_m", ".0f"),
-    "SPL %": ("spl", ".2f"),
-    "TNT steps": ("steps", ".2f"),
-    "worst run, SPL %": ("worst", ".2f"),
-    "path efficiency %": ("path_efficiency", ".2f"),
-    "NE km": ("navigation_error_km", ".1f"),
-    "within 10 km %": ("success_rate_within_10km", ".1f"),
-    "within 25 km %": ("success_rate_within_25km", ".1f"),
-    "final distance, median km": ("final_distance_km_median", ".1f"),
-    "false arrivals %": ("false_arrival_rate", ".1f"),
-    "not declared %": ("not_declared_rate", ".1f"),
-    "smoothness °": ("smoothness_deg", ".1f"),
-    "MAE °": ("heading_mae_deg", ".1f"),
-    "readings": ("field_readings", ".0f"),
-}
+COLUMNS = {measure.label: (measure.summary, measure.form) for measure in MEASURES if measure.label}
+COLUMNS |= {"worst run, SPL %": ("worst", ".2f"), "readings": ("field_readings", ".0f")}
 """Heading, measure of :func:`cell` and number format of :func:`comparison_table`; the first four are the paper's."""
 
 SHORT_COLUMNS = ("SR %", "SPL %", "TNT steps", "NE km", "false arrivals %", "not declared %")

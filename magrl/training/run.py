@@ -29,7 +29,8 @@ from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns, summarize
+from magrl.envs.measures import summarize
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
 from magrl.evaluation.flight import Flight
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere

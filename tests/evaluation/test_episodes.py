@@ -20,17 +20,22 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from magrl import Anywhere, episode_measures, evaluate, evaluation_rollout, summarize
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
-from magrl.envs.measures import path_efficiency, path_measures, spl
+from magrl.envs.measures import (
+    Episode,
+    bootstrap_interval,
+    interquartile_mean,
+    measured,
+    path_efficiency,
+    spl,
+    stratified_bootstrap,
+    wilson_interval,
+)
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import Flight
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import (
-    bootstrap_interval,
     first_episode_mask,
-    interquartile_mean,
     moved,
-    stratified_bootstrap,
-    wilson_interval,
 )
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import Secant, policy_env
@@ -214,11 +219,13 @@ def test_spl_by_hand() -> None:
     assert path_efficiency(torch.tensor([50.1, 10.0]), torch.tensor([50.0, 40.0])).tolist() == [1.0, 0.25]
 
 
-def test_path_measures_take_any_batch() -> None:
+def test_measures_of_ends_take_any_batch() -> None:
     """One degree of latitude at the equator is 110.5744 km; a twice as long path has half the efficiency."""
     start, end = torch.tensor([0.0, 10.0]).double().expand(3, 1, 2), torch.tensor([1.0, 10.0]).double().expand(3, 1, 2)
-    got = path_measures(torch.ones(3, 1) > 0, start, end, end, torch.full((3, 1), 2 * 110.5744))
+    one = torch.ones(3, 1)
+    got = measured(Episode(one > 0, one, start, end, end, 2 * 110.5744 * one))
     expected = {"shortest_km": 110.5744, "navigation_error_km": 0, "spl": 0.5, "path_efficiency": 0.5}
+    assert got.keys() == expected.keys() | {"success", "steps", "length_km"}
     for key, value in expected.items():
         torch.testing.assert_close(got[key].double(), torch.full((3, 1), value).double(), atol=1e-4, rtol=0)
 
