@@ -28,7 +28,18 @@ from magrl.tracking.destination import RANGE_KM
 from magrl.tracking.network import correction_network
 from magrl.tracking.observation import OBSERVATION_SIZE
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, Discount, Noise, NonNegative, PlanetConfig, Positive, Rising, Widths
+from magrl.training.config import (
+    Count,
+    Discount,
+    Noise,
+    NonNegative,
+    PlanetConfig,
+    Positive,
+    Rising,
+    Widths,
+    make_presets,
+    read_presets,
+)
 from magrl.training.run import make_collector
 from magrl.transforms import (
     DeclareArrival,
@@ -55,6 +66,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 RECIPE = "ppo_anywhere.py"
+TABLES = read_presets(__file__)
 LOSSES = ("loss_critic", "loss_actor", "kl_approx", "clip_fraction", "explained_variance")
 OBSERVED = ("observation", "true_displacement_scaled", "highest_spl")
 TRANSITION = (
@@ -68,7 +80,7 @@ TRANSITION = (
 class Config(rule_settings("zeta", "arrival", "radius_km", "max_leg_km", "max_turn_deg", max_steps=120), PlanetConfig):
     """Settings of a training; the defaults are the preset's."""
 
-    preset: Literal["far", "fast"] = "far"
+    preset: Literal[*TABLES] = "far"  # type: ignore[valid-type]
     """Source of the defaults: destinations 150-1800 km away, or 300-500 km."""
 
     # Own defaults of shared settings
@@ -109,9 +121,7 @@ class Config(rule_settings("zeta", "arrival", "radius_km", "max_leg_km", "max_tu
         return self.max_leg_km + self.drift_km
 
 
-FAR = Config()
-FAST = Config(preset="fast", distance_range_km=(300.0, 500.0), max_steps=50, noise_exponent=1.5, total_frames=1_310_720)
-PRESETS = {"far": FAR, "fast": FAST}
+PRESETS = make_presets(Config, TABLES)
 
 
 def errors(config: Config, seed: int) -> list[Transform]:

@@ -12,7 +12,7 @@ import tyro
 from pydantic import AfterValidator, Field, model_validator
 
 from magrl import paper
-from magrl.checks import CheckedModel, UsageError, check_device, printable, short
+from magrl.checks import CheckedModel, UsageError, check_choice, check_device, printable, short
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document
@@ -214,6 +214,53 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
 
 
 Config = TypeVar("Config")
+
+
+def read_presets(script: str, **others: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the settings of each preset of a recipe, from the file ``presets.toml`` beside it.
+
+    Args:
+        script: path of the recipe; its presets are the tables ``[NAME.PRESET]`` with its name.
+        **others: settings by name that a preset may extend, as another preset (``extends``).
+
+    Raises:
+        ValueError: for a file that is not valid, or a preset that extends an unknown one.
+    """
+    path = Path(script)
+    tables = read_document(path.with_name("presets.toml"))[path.stem]
+    known = tables | others
+
+    def settings(name: str) -> dict[str, Any]:
+        check_choice(list(known), extends=name)
+        own = {"preset": name, **known[name]}
+        base = own.pop("extends", None)
+        return (settings(base) if base else {}) | {k: tuple(x) if isinstance(x, list) else x for k, x in own.items()}
+
+    return {name: settings(name) for name in tables}
+
+
+def make_presets(kind: type[Config], tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Config]:
+    """Return the presets of a recipe by name, validated.
+
+    Args:
+        kind: class of the settings.
+        tables: settings of each, as of :func:`read_presets`.
+
+    Raises:
+        ValueError: for a setting that is unknown or out of its range, naming preset, setting and value.
+
+    Example:
+        >>> make_presets(RunConfig, {"fast": {"seed": -1}})
+        Traceback (most recent call last):
+        ValueError: preset fast: seed must be greater than or equal to 0, got -1
+    """
+    presets = {}
+    for name, settings in tables.items():
+        try:
+            presets[name] = kind(**settings)
+        except ValueError as error:
+            raise ValueError(f"preset {name}: {error}") from None
+    return presets
 
 
 def parse_config(

@@ -21,7 +21,7 @@ from magrl.training import parse_config
 
 
 def training_env(noise: tuple[float, float, float] = (0.0, 0.0, 0.0), km: tuple = (300.0, 500.0), **rules):
-    scenario = planet_scenario(8, seed=3, **recipe.FAST.regions | {"distance_range_km": km})
+    scenario = planet_scenario(8, seed=3, **recipe.PRESETS["fast"].regions | {"distance_range_km": km})
     base = GeomagneticNavEnv(scenario, num_envs=6, start_heading="random", seed=5, **rules)
     return recipe.make_env(base, recipe.Config(noise=noise))
 
@@ -47,7 +47,7 @@ def test_critics_see_the_true_displacement_and_the_return_is_the_reward() -> Non
 def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None:
     env = training_env(km=(60.0, 90.0), arrival="declared", radius_km=25.0, max_steps=6)
     assert env.action_spec.shape == (6, 2)
-    actor = make_correcting_actor(correction_network((8,)), recipe.rules_of(env.base_env, recipe.FAST))
+    actor = make_correcting_actor(correction_network((8,)), recipe.rules_of(env.base_env, recipe.PRESETS["fast"]))
     assert actor.in_keys == ["observation", ("track", "plan"), "heading"]
     td = env.rollout(6, actor, break_when_any_done=False)["next"]
     first = td["done"].cumsum(1) - td["done"].long() == 0
@@ -58,7 +58,7 @@ def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None
 
 
 def test_the_vehicle_is_that_of_the_settings() -> None:
-    config = recipe.FAST.replace(max_leg_km=10.0, max_turn_deg=20.0, drift=0.2)
+    config = recipe.PRESETS["fast"].replace(max_leg_km=10.0, max_turn_deg=20.0, drift=0.2)
     planets = planet_scenario(4, seed=3, **config.regions)
     base = GeomagneticNavEnv(planets, num_envs=6, seed=5, drift_km=config.drift_km, **config.rules)
     rules = recipe.rules_of(base, config)

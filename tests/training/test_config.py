@@ -12,6 +12,7 @@ import td3_gradient_guided as recipe
 
 from magrl import paper
 from magrl.training import RegionConfig, UsageError, command, parse_config
+from magrl.training.config import make_presets, read_presets
 
 ROOT = Path(__file__).parent.parent.parent
 OWN = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
@@ -65,6 +66,21 @@ def test_every_setting_can_be_given_as_wandb_sweeps_write_it(name: str) -> None:
     assert "--noise=[0.05, 0.05, 5.0]" in words
     own = parse_config(module.Config, presets, "mine.py", None, ["--noise", "0.05", "0.05", "5"])
     assert own.noise == config.noise
+
+
+def test_presets_are_read_beside_their_recipe(tmp_path: Path, monkeypatch) -> None:
+    """From any directory; a preset has its own settings before those of the one that it extends."""
+    folder = tmp_path / "recipes"
+    folder.mkdir()
+    text = '[mine.fast]\nextends = "table"\nseed = 2\n[mine.slow]\nextends = "fast"\nnoise = [0, 0.1, 5]\n'
+    (folder / "presets.toml").write_text(text + '[mine.bad]\nextends = "tabel"\n[other.fast]\n', encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="extends must be one of 'fast', 'slow', 'bad', 'table', got 'tabel'"):
+        read_presets("recipes/mine.py", table={"seed": 1, "gamma": 0.5})
+    (folder / "presets.toml").write_text(text, encoding="utf-8")
+    found = read_presets("recipes/mine.py", table={"seed": 1, "gamma": 0.5})
+    assert found["slow"] == {"preset": "slow", "seed": 2, "gamma": 0.5, "noise": (0, 0.1, 5)}
+    assert make_presets(dict, found) == found
 
 
 # Runs that are resumed
