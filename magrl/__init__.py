@@ -10,7 +10,7 @@ import os as _os
 import gymnasium as _gymnasium
 import lazy_loader as _lazy_loader
 
-from magrl.registry import NAMED_TASKS as _NAMED_TASKS
+from magrl.named_tasks import NAMED_TASKS as _NAMED_TASKS
 
 _os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 

@@ -21,10 +21,10 @@ from magrl import paper
 from magrl.agents import optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import Scenario, earth_scenario, planet_scenario
-from magrl.envs.navigation import NAMED_ENVS
+from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators.memory import LIMITS, Memory, MemoryNetwork, action_of
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, PlanetConfig, Positive, Widths
+from magrl.training.config import Count, PlanetConfig, Positive, Widths, make_presets, read_presets
 from magrl.training.run import make_collector
 from magrl.transforms.areas import turned
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE
@@ -41,6 +41,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 RECIPE = "ppo_memory.py"
+TABLES = read_presets(__file__)
 LOSSES = ("loss_memory", "loss_critic", "loss_actor", "kl_approx", "clip_fraction", "explained_variance")
 KNOWN = ("memory", "observation", "estimate")
 JUDGED = ("observation", "true_displacement_scaled", "highest_spl")
@@ -52,7 +53,7 @@ SEQUENCE = ("observation", "hidden", "is_init", "true_displacement", "heading")
 class Config(PlanetConfig):
     """Settings of a training; the defaults are the preset's."""
 
-    preset: Literal["standard", "fast", "large"] = "standard"
+    preset: Literal[*TABLES] = "standard"  # type: ignore[valid-type]
     """Source of the defaults: ten million steps, one million, or a hundred million for a GPU."""
     task: Literal["storm", "readings"] = "storm"
     """Named task, which sets the errors of the sensors."""
@@ -77,10 +78,7 @@ class Config(PlanetConfig):
     """Sequences per gradient step of the memory."""
 
 
-STANDARD = Config()
-FAST = Config(preset="fast", total_frames=1_015_808, memory_batches=5)
-LARGE = Config(preset="large", total_frames=100_663_296, num_envs=16_384, batch_size=65_536, sequences=2048)
-PRESETS = {"standard": STANDARD, "fast": FAST, "large": LARGE}
+PRESETS = make_presets(Config, TABLES)
 
 
 def make_env(planets: Scenario, config: Config) -> TransformedEnv:
@@ -97,7 +95,8 @@ def make_env(planets: Scenario, config: Config) -> TransformedEnv:
 
 def task_env(scenario: Scenario, config: Config, **options: Any) -> TransformedEnv:
     """Return the environment of the task over the regions of a scenario."""
-    return NAMED_ENVS[config.task](scenario=scenario, max_steps=config.max_steps, device=config.device, **options)
+    make = NAMED_TASKS[config.task].make
+    return make(scenario=scenario, max_steps=config.max_steps, device=config.device, **options)
 
 
 def evaluation_env(scenario: Scenario, num_tasks: int, tasks_seed: int, seed: int, config: Config) -> EnvBase:

@@ -14,38 +14,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from functools import partial
+from typing import Annotated, Any, Literal
 
 from magrl import paper
-from magrl.agents import (
-    AreaGeometry,
-    FieldPolicy,
-    PolicyConfig,
-    SoftUpdate,
-    TD3Loss,
-    make_critic,
-    optimize,
-    saturation_penalty,
-)
-from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import guidance_pair, task_transforms, task_view
+from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
+from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.envs.navigation import guidance
 from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
-from magrl.registry import NAMED_TASKS
+from magrl.named_tasks import NAMED_TASKS
 from magrl.training import Run, command, parse_config
-from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig
+from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
 from magrl.training.run import make_collector
-from magrl.transforms import (
-    AlignmentReward,
-    DistanceCost,
-    EpisodeSum,
-    FieldGradient,
-    GradientHeading,
-    LegsView,
-    ObservationView,
-    ProgressReward,
-    SensorErrors,
-)
+from magrl.transforms import DistanceCost, EpisodeSum, ProgressReward, SensorErrors, TrueDisplacement
 
 import torch
 from pydantic import Field, model_validator
@@ -53,29 +35,35 @@ from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, RewardScaling, RewardSum, Transform, TransformedEnv
+from torchrl.envs import RewardScaling, RewardSum, Transform, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_noise")
-ENV_OPTIONS = {"objective_limit", "device"}
-TASKS = tuple(name for name, row in NAMED_TASKS.items() if {"GG-TD3", "TD3-magrl"} & row.budget.keys())
+CONSTANT = {f"final_{name}": paper.TABLE_1[name] for name in ("learning_rate", "exploration_noise")}
+"""The paper's rates do not change."""
+TABLES = read_presets(__file__, table_1=paper.TABLE_1 | CONSTANT)
+TASKS = tuple(dict.fromkeys(table["task"] for table in TABLES.values()))
+UNIT = 20.0
+"""Reward of the paper for a reward of 1 for progress: 200 at the arrival."""
 
 
 class Config(rule_settings("start_heading"), RegionConfig):
     """Settings of a training; the defaults are the preset's."""
 
-    preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo", "eddies"] = "fast"
+    preset: Literal[*TABLES] = "fast"  # type: ignore[valid-type]
     """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance; or for a task."""
-    task: Literal[*TASKS] = "box"  # type: ignore[valid-type]
-    """Named task: the paper's; around no-go areas, or in eddies, with a reward for progress, and 200 at the arrival."""
+    task: Literal[*TASKS] = TASKS[0]  # type: ignore[valid-type]
+    """Named task (docs/tasks.md)."""
+    reward: Literal["base", "progress"] = "base"
+    """Reward: the paper's without its alignment, or for progress to the destination, with 200 at the arrival, too."""
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
 
     # Environment
     distance_cost: NonNegative = 0.0
-    """Cost of a leg [1/km]; 0.1 in presets fast and nogo, none in the paper."""
+    """Cost of a leg [1/km]; none in the paper."""
     objective_limit: Positive | None = None
     """Upper bound on the objective in the proximity reward; 10 in preset paper."""
     time_limit_ends: bool = False
@@ -118,6 +106,11 @@ class Config(rule_settings("start_heading"), RegionConfig):
     init_random_frames: Annotated[int, Field(ge=0)] = 1024
     """Number of initial steps with random actions."""
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the environment among the settings."""
+        return self.rules | self.model_dump(include={"objective_limit", "device"})
+
     @model_validator(mode="after")
     def _fits(self) -> Config:
         start, end = self.exploration_noise, self.final_exploration_noise
@@ -130,56 +123,34 @@ class Config(rule_settings("start_heading"), RegionConfig):
         return self
 
 
-PAPER = Config(
-    preset="paper",
-    **paper.TABLE_1,
-    final_learning_rate=paper.TABLE_1["learning_rate"],
-    final_exploration_noise=paper.TABLE_1["exploration_noise"],
-    num_envs=1,
-    total_frames=1_000_000,
-    layer_norm=False,
-    observe_difference=False,
-    updates_per_batch=1,
-    init_random_frames=1000,
-    objective_limit=10.0,
-    time_limit_ends=True,
-    eval_every=1000,
-)
-PRESETS = {"fast": Config(distance_cost=0.1), "paper": PAPER}
-PRESETS["td3-fast"] = Config(preset="td3-fast", guided=False)
-NAMED = {"guided": False, "distance_cost": 0.1, "final_exploration_noise": 0.05}
-NOGO = {"learning_rate": 1.5e-3, "final_learning_rate": 2e-5, "tau": 0.03, "updates_per_batch": 24, "batch_size": 256}
-NOGO |= {"policy_noise": 0.05, "noise_clip": 0.15, "total_frames": 716_800}
-EDDIES = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "updates_per_batch": 16, "batch_size": 512}
-EDDIES |= {"exploration_noise": 0.3, "noise_clip": 0.3, "total_frames": 284_928, "gamma": 0.95, "time_limit_ends": True}
-EDDIES |= {"num_envs": 256, "num_cells": (256, 256), "init_random_frames": 5120, "eval_every": 80}
-PRESETS |= {name: Config(preset=name, task=name, **NAMED, **own) for name, own in (("nogo", NOGO), ("eddies", EDDIES))}
-PRESETS["td3-paper"] = PAPER.replace(preset="td3-paper", guided=False)
+PRESETS = make_presets(Config, TABLES)
 
 
-def of_the_task(config: Config) -> list[Transform]:
-    """Return the transforms of the task, and the reward for progress in the unit of the paper's; none on *Box*."""
-    transforms = task_transforms(config.task)
-    return transforms and [*transforms, ProgressReward(), RewardScaling(0.0, 20.0)]
-
-
-def make_env(base: GeomagneticNavEnv, view: LegsView | ObservationView, config: Config) -> TransformedEnv:
-    """Add guidance by the true field, the sensors' noise, the agent's view and the scaled reward to the environment."""
+def rewards(base: GeomagneticNavEnv, config: Config, *, training: bool = False) -> list[Transform]:
+    """Return the transforms of the reward; in training, with guidance, cost of the distance, sums, and scale."""
+    progress = [TrueDisplacement(), ProgressReward(), RewardScaling(0.0, UNIT)] if config.reward == "progress" else []
+    if not training:
+        return progress
     keys = ["reward", "reward_alignment"]
-    guidance = [
-        FieldGradient(base.field),
-        GradientHeading(pair=guidance_pair(base)),
-        AlignmentReward(out_keys=keys, weight=config.alignment_weight, offset=config.alignment_offset),
-    ]
-    sensors = [SensorErrors(config.noise, seed=base.seed)] if any(config.noise) else []
-    scaling = [*view.observation_transforms(), view.action_transform()]
-    task = of_the_task(config)
-    terms = [*(() if task else REWARD_TERMS), *(keys[1:] if config.guided else ())]
+    alignment = {"weight": config.alignment_weight, "offset": config.alignment_offset}
+    guided = guidance(base, out_keys=keys, **alignment) if config.guided else []
+    terms = [*(() if progress else REWARD_TERMS), *(keys[1:] if guided else ())]
     sums = [RewardSum(), *([EpisodeSum(terms)] if terms else [])]
-    rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    guided = guidance if config.guided else []
-    env = TransformedEnv(base, Compose(*task, *guided, *sensors))
-    return TransformedEnv(env, Compose(*view.needed(env), *scaling, *rewards), auto_unwrap=True)
+    scaled = [DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
+    return [*progress, *guided, *sums, *scaled]
+
+
+def make_env(scenario: Scenario, config: Config) -> TransformedEnv:
+    """Return the environment of the training: the task with the reward, the sensors' noise and what is observed."""
+    return NAMED_TASKS[config.task].make(
+        config.num_envs,
+        scenario=scenario,
+        seed=config.seed,
+        reward=partial(rewards, config=config, training=True),
+        transforms=[SensorErrors(config.noise, seed=config.seed)] if any(config.noise) else [],
+        **config.options,
+        **config.model_dump(include={"observe_heading", "observe_difference"}),
+    )
 
 
 def make_collection(
@@ -209,22 +180,16 @@ def train(config: Config) -> dict[str, float]:
     """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
     torch.manual_seed(config.seed)
     name = f"td3_gradient_guided-{config.preset}" if config.guided else f"td3-{config.preset.removeprefix('td3-')}"
-    name += f"-{config.task}" if config.task not in ("box", config.preset) else ""
+    name += f"-{config.task}" if config.task != PRESETS[config.preset].task else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        options = config.rules | config.model_dump(include=ENV_OPTIONS) | dict(NAMED_TASKS[config.task].options)
-        base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
-        validation, test = run.evaluation_envs(*of_the_task(config), **options)
-        view = task_view(base, config.task, **config.model_dump(include={"observe_heading", "observe_difference"}))
-        env = make_env(base, view, config)
+        env, reward = make_env(run.scenario.with_tasks(None), config), partial(rewards, config=config)
+        validation, test = run.evaluation_envs(NAMED_TASKS[config.task].make, reward=reward, **config.options)
 
         # Networks
-        shape = {
-            "layer_norm": config.layer_norm,
-            "geometry": "areas" in view.in_keys and view.size == AreaGeometry.SIZE,
-        }
-        actor = (network := PolicyConfig(view, config.num_cells, **shape)).make_actor(env.device)
-        critic = make_critic(view.size, config.num_cells, **shape, device=env.device)
+        shape = {"layer_norm": config.layer_norm, "geometry": env.view.geometry}
+        actor = (network := PolicyConfig(env.view, config.num_cells, **shape)).make_actor(env.device)
+        critic = make_critic(env.view.size, config.num_cells, **shape, device=env.device)
 
         # Loss, with clipped double Q and target policy smoothing
         loss = TD3Loss(actor, critic, **config.model_dump(include={"gamma", "policy_noise", "noise_clip"}))
@@ -236,9 +201,8 @@ def train(config: Config) -> dict[str, float]:
         noise, collector, buffer = make_collection(env, actor, config)
         policy = FieldPolicy(network, actor).to(env.device)
         parts = {"critic_optimizer": critic_optimizer, "actor_optimizer": actor_optimizer, "noise": noise}
-        run.start(
-            policy=policy, validation=validation, env=base, collector=collector, loss=loss, buffer=buffer, **parts
-        )
+        parts |= {"loss": loss, "buffer": buffer}
+        run.start(policy=policy, validation=validation, env=env.base_env, collector=collector, **parts)
         stats = run.statistics
         for batch in run.batches():
             buffer.extend(batch.reshape(-1).select(*TRANSITION))

@@ -33,7 +33,7 @@ def pytest_collection_finish() -> None:
 def few_planets() -> Iterator[None]:
     """Fly the named tasks over 8 regions of random planets: 1024 take seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("magrl.envs.navigation.PLANET_REGIONS", 8)
+        patch.setattr("magrl.named_tasks.PLANET_REGIONS", 8)
         yield
 
 

@@ -7,10 +7,10 @@ The action of this agent is the leg itself; `anywhere` corrects the leg that `ka
 """
 
 from magrl import earth_scenario, evaluate, summarize
-from magrl.envs.navigation import anywhere_env
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.tables import short_table
+from magrl.named_tasks import anywhere_env
 from magrl.transforms import SensorErrors
 
 import gymnasium

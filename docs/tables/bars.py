@@ -13,19 +13,21 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from currents import CURRENT_RULES
-from magrl.envs.navigation import NAMED_ENVS, storm_errors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
+from magrl.files import read_document
 from magrl.geodesy import steer
+from magrl.named_tasks import NAMED_TASKS, storm_errors
 from magrl.navigators import Navigator, Secant
-from magrl.registry import NAMED_TASKS
 from magrl.training import command
 from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, turned
 
@@ -47,6 +49,20 @@ BARS |= {"parallel": "parallel (oracle)", "offset": "bearing that offsets half o
 BARS |= {"estimated": "plan on a Gaussian process of the currents (a map, their spectrum)"}
 BARS |= {"mapped": "plan on the true currents (oracle)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
+
+
+class Shown(NamedTuple):
+    """What tables and figures show of a named task, as tasks.toml explains."""
+
+    budget: Mapping[str, float] = {"PPO": 500}
+    reference: str = "kalman"
+    bars: Sequence[str] = ("geodesic",)
+    picture: Sequence[Any] = ("kalman", 0)
+
+
+_TABLES = read_document(Path(__file__).with_name("tasks.toml"))
+TASKS = {task: Shown(**_TABLES.get(task, {})) for task in NAMED_TASKS}
+"""What is shown, by the name of the task."""
 
 
 class Detour(Navigator):
@@ -144,9 +160,9 @@ class Around(TensorDictModuleBase):
 def flown(task: str, navigator: str, vehicles: int | None = None, **options: Any) -> tuple[EnvBase, TensorDictBase]:
     """Return the environment of a task with options, and the first episode of each vehicle; as of :func:`bar`."""
     options |= {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
-    observation = "legs" if NAMED_TASKS[task].legs else "dict"
+    observation = "legs" if navigator in CURRENT_RULES else "dict"  # rules of currents read the fixes of a map
     count = min(vehicles or VEHICLES, FEWER.get(navigator, math.inf))
-    env = NAMED_ENVS[task](count, observation=observation, scale_actions=False, seed=SEED, **options)
+    env = NAMED_TASKS[task].make(count, observation=observation, scale_actions=False, seed=SEED, **options)
     rules: dict[str, Any] = {
         "detour": Detour,
         "sighted": Sighted,
@@ -174,7 +190,7 @@ def bar(task: str, navigator: str) -> dict[str, float]:
 
 def bars_of(task: str) -> list[str]:
     """Return the bars of a task, the oracle last."""
-    return ["secant", "kalman", "anywhere", *NAMED_TASKS[task].bars]
+    return ["secant", "kalman", "anywhere", *TASKS[task].bars]
 
 
 def main() -> None:

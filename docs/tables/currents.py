@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from magrl.envs.navigation import NAMED_TASKS
 from magrl.geodesy import geodesic, move_place, polar, steer
+from magrl.named_tasks import EDDY_MOTION
 from magrl.navigators import Navigator
 from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
 
@@ -18,7 +18,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-MOTION = NAMED_TASKS["eddies"].transforms["MotionError"]
 LEG_KM, RADIUS_KM, LEGS = 25.0, 25.0, 60
 HALF_KM, CELL_KM, SWEEPS = 700.0, 25.0, 80
 HEADINGS, FINAL = 24, 72
@@ -132,10 +131,10 @@ class Estimated(CurrentRule):
         generator = torch.Generator().manual_seed(0)
         height, angle = torch.rand(2, self.WAVES, generator=generator)
         share = torch.sqrt(1 - (2 * height - 1).square())  # of a wave of random direction in space that is level
-        self.wave = share.unsqueeze(-1) * unit(2 * math.pi * angle) * 2 * math.pi / MOTION["eddy_km"]
+        self.wave = share.unsqueeze(-1) * unit(2 * math.pi * angle) * 2 * math.pi / EDDY_MOTION["eddy_km"]
         across = torch.stack((-self.wave[:, 1], self.wave[:, 0]), -1) / self.wave.norm(dim=-1, keepdim=True)
         self.across, self.grid = across * (share * math.sqrt(3 / self.WAVES)).unsqueeze(-1), Grid()
-        self.rms = MOTION["eddies_km_h"] / MOTION["speed_km_h"]
+        self.rms = EDDY_MOTION["eddies_km_h"] / EDDY_MOTION["speed_km_h"]
         self.nodes = self.features(self.grid.nodes)
 
     def features(self, place: Tensor) -> Tensor:
@@ -193,7 +192,7 @@ class Mapped(Estimated):
         distance, bearing = polar(place.double())
         there = move_place(target.expand(len(place), 2), bearing, distance)
         phases, directions = numbers[3:].tensor_split([EDDIES], -1)
-        return (self.rms * eddy_velocity(there, eddy_waves(directions, MOTION["eddy_km"]), phases)).float()
+        return (self.rms * eddy_velocity(there, eddy_waves(directions, EDDY_MOTION["eddy_km"]), phases)).float()
 
 
 CURRENT_RULES = {"offset": Offset, "estimated": Estimated, "mapped": Mapped}

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bars import BARS, flown
-from magrl.envs.navigation import storm_errors
 from magrl.evaluation.scores import scored
 from magrl.evaluation.tables import markdown_table
 from magrl.field.records import weather_record
 from magrl.files import write_text
+from magrl.named_tasks import storm_errors
 from magrl.training import command
+from magrl.transforms import SensorErrors
 
 import tyro
 from tqdm import tqdm
@@ -33,7 +34,7 @@ class Ladder(NamedTuple):
     levels: list[dict[str, Any]]
 
 
-EDDIES = [*({"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)), {"noise": (0.02, 0.02, 2.0)}]
+EDDIES = [*({"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)), {"transforms": [SensorErrors((0.02, 0.02, 2.0))]}]
 DISCS = [{"discs": number} for number in (2, 4, 8)]
 STORMS = [{"transforms": storm_errors(replace(STORM, variation=x * STORM.variation))} for x in (0.5, 1.0, 2.0)]
 LADDERS = (

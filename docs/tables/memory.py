@@ -16,11 +16,11 @@ from typing import Any
 from bars import BARS
 from magrl import paper
 from magrl.envs import planet_scenario
-from magrl.envs.navigation import storm_errors
 from magrl.evaluation import score
 from magrl.evaluation.tables import markdown_table
 from magrl.field import WeatherRecord, weather_record
 from magrl.files import write_text
+from magrl.named_tasks import storm_errors
 from magrl.navigators.memory import LIMITS
 from magrl.training import command
 from magrl.transforms import CONDITIONS

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from magrl.envs import Region
-from magrl.envs.navigation import task_transforms
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
@@ -26,7 +25,7 @@ from magrl.field import IGRF, FieldModel
 from magrl.field.elements import UNITS
 from magrl.files import read_text, write_with
 from magrl.geodesy import geodesic
-from magrl.registry import NAMED_TASKS
+from magrl.named_tasks import EDDY_MOTION, NAMED_TASKS
 from magrl.training import command
 from magrl.transforms.areas import outlines
 from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
@@ -44,7 +43,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent))
-from bars import flown
+from bars import TASKS, flown
 from flights import Flights, believed_places
 
 SHOWN, WITHIN_KM = 212, 25.0
@@ -206,7 +205,7 @@ def draw_scale(axes: Axes) -> None:
 
 def task_picture(task: str) -> Figure:
     """Return a map of an episode, or on *Storm* the errors of its readings."""
-    navigator, episode = NAMED_TASKS[task].picture
+    navigator, episode = TASKS[task].picture
     env, rollout = flown(task, navigator, VEHICLES)
     steps = rollout[episode]
     steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
@@ -262,8 +261,8 @@ def draw_currents(axes: Axes, numbers: Tensor, low: Tensor, high: Tensor) -> Qui
     latitude, longitude = (torch.linspace(*pair, 18, dtype=torch.float64) for pair in ends)
     places = torch.cartesian_prod(latitude, longitude)
     phases, directions = numbers[3:].tensor_split([EDDIES], -1)
-    motion = task_transforms("eddies")[0]
-    north, east = (motion.eddies_km_h * eddy_velocity(places, eddy_waves(directions, motion.eddy_km), phases)).T
+    waves = eddy_waves(directions, EDDY_MOTION["eddy_km"])
+    north, east = (EDDY_MOTION["eddies_km_h"] * eddy_velocity(places, waves, phases)).T
     return axes.quiver(*places.T.flip(0), east, north, color=AREA, width=0.003, scale=25)
 
 

@@ -29,17 +29,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from agents import keep_agents, save_agent
-from bars import BARS, VEHICLES, bar, bars_of
+from bars import BARS, TASKS, VEHICLES, bar, bars_of
 from flights import write_picture
 from magrl import score
 from magrl.checks import check_choice
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.measures import interquartile_mean, stratified_bootstrap
-from magrl.envs.navigation import task_name
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
-from magrl.registry import NAMED_TASKS
+from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.training import UsageError, command
 from workers import Backend, mapped
 
@@ -145,7 +144,7 @@ def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
     chosen = ALGORITHMS[name]
     envs = GeomagneticNavVectorEnv(chosen.num_envs, task=task, autoreset_mode="SameStep")
     model = chosen.make(BatchedVecEnv(envs), seed=seed, device="cpu", **deepcopy(chosen.settings))
-    curve = Curve(task, 1000 * NAMED_TASKS[task].budget[name])
+    curve = Curve(task, 1000 * TASKS[task].budget[name])
     model.learn(curve.steps, callback=curve)
     curve.point(VEHICLES)  # after the last update
     save_agent(agent, model.policy, task)
@@ -189,7 +188,7 @@ def run(config: Config, job: tuple[str, str, int]) -> Path:
 def planned(config: Config) -> Iterator[tuple[str, str, int]]:
     """Yield task, algorithm and seed of all runs, in the order of their seeds."""
     for seed, name in itertools.product(config.seeds, config.algorithms):
-        yield from ((task, name, seed) for task in config.tasks if name in NAMED_TASKS[task].budget)
+        yield from ((task, name, seed) for task in config.tasks if name in TASKS[task].budget)
 
 
 def ends(curves: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:

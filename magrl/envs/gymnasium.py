@@ -1,6 +1,6 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
-``import magrl`` registers the named tasks (:data:`magrl.registry.NAMED_TASKS`). The classes run their TorchRL
+``import magrl`` registers the named tasks (:data:`magrl.named_tasks.NAMED_TASKS`). The classes run their TorchRL
 environments, and only convert tensors to arrays: the same seed and the same actions give the same bits.
 """
 
@@ -25,8 +25,8 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
 
 from magrl.envs.measures import Episode, measured
-from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.envs.specs import PUBLIC_KEYS
+from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.transforms.areas import outlines
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
@@ -97,7 +97,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         autoreset_mode: mode, or its value: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         max_episode_steps: Gymnasium's name of ``max_steps``.
         task: name or id of the task, which ``gymnasium.make`` sets.
-        **options: of its function in :data:`magrl.envs.navigation.NAMED_ENVS`; all take the options of
+        **options: of its function in :mod:`magrl.named_tasks`; all take the options of
             :func:`magrl.envs.navigation.navigation_env`.
 
     Raises:
@@ -129,7 +129,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)  # where TorchRL's GymWrapper reads it
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.torchrl_env = NAMED_ENVS[task_name(task)](num_envs, render_mode=render_mode, **options)
+        self.torchrl_env = NAMED_TASKS[task_name(task)].make(num_envs, render_mode=render_mode, **options)
         observation = options.get("observation", "flat")  # or another array, by default of the task
         self._flat = isinstance(observation, str) and observation != "dict"
         areas = [key for key in ("areas",) if key in self.torchrl_env.observation_spec.keys()]  # noqa: SIM118

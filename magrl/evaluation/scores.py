@@ -18,10 +18,10 @@ from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_number, short
 from magrl.envs.measures import summarize
-from magrl.envs.navigation import NAMED_ENVS, task_name
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
 from magrl.evaluation.navigators import make_navigator, named
+from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.navigators import Navigator
 
 SEED = paper.FIRST_RESERVED_SEED + 69
@@ -46,11 +46,11 @@ def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
             - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
               ``act(observations, state)`` returns actions and the next state, which is None at the start: arrays with
               the vehicles on their first or second axis, or a tuple, list or dict of them. It gets no other key.
-        task: name or id of a task in :data:`magrl.registry.NAMED_TASKS`: ``"nogo"``, or
+        task: name or id of a task in :data:`magrl.named_tasks.NAMED_TASKS`: ``"nogo"``, or
             ``"magrl/GeomagneticNavigationNoGo-v0"``.
         episodes: vehicles, each with one episode.
         seed: seed of the episodes; the default is reserved for evaluations.
-        options: of its function in :mod:`magrl.envs.navigation`. The score is then not the task's.
+        options: of its function in :mod:`magrl.named_tasks`. The score is then not the task's.
 
     Returns:
         ``SR``, success rate [%]; ``SPL`` [%] with its bootstrap 95 % interval over episodes, ``SPL_low`` and
@@ -75,7 +75,7 @@ def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
 
 def flown(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **options: Any) -> TensorDict:
     """Return the rollout of :func:`score`, as :func:`magrl.evaluation.episode_measures` takes it."""
-    policy, make = _policy(agent), partial(NAMED_ENVS[task_name(task)], episodes, seed=seed, **options)
+    policy, make = _policy(agent), partial(NAMED_TASKS[task_name(task)].make, episodes, seed=seed, **options)
     if isinstance(policy, str) or "observation" not in policy.in_keys:
         env = make(observation="dict", scale_actions=False)
         policy = make_navigator(policy, env.base_env) if isinstance(policy, str) else policy

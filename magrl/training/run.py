@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -22,16 +22,15 @@ from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
-from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.envs.measures import summarize
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
-from magrl.evaluation.flight import Flight
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere
 from magrl.sensor_std import PERFECT, Noise
@@ -39,6 +38,7 @@ from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, c
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
 from magrl.training.wandb_run import WandbRun
+from magrl.transforms import SensorErrors
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
 """Measures of the validation tasks in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
@@ -170,24 +170,23 @@ class Run:
             settings["scenario"] = f"scenario{self._file.suffix}"
         return settings | {"out": self.folder.name, "resume": None}
 
-    def evaluation_envs(self, *transforms: Transform, **options: Any) -> tuple[EnvBase, EnvBase]:
+    def evaluation_envs(self, make: Callable[..., EnvBase], **options: Any) -> tuple[EnvBase, EnvBase]:
         """Return the environments of the validation tasks and of the test tasks, with the sensor noise of the run.
 
         Args:
-            transforms: further transforms of the task, such as its no-go areas; they are cloned.
-            options: options of :class:`magrl.envs.GeomagneticNavEnv`.
+            make: function that makes an environment, as of a named task (:mod:`magrl.named_tasks`).
+            options: its options.
         """
 
-        def make(scenario: Scenario, seed: int) -> EnvBase:
-            env = Flight(scenario, errors=self.noise, seed=seed, **options).env
-            task = Compose(*(transform.clone() for transform in transforms))
-            return TransformedEnv(env, task, auto_unwrap=True) if transforms else env
+        def env_of(tasks: Tasks, seed: int) -> EnvBase:
+            sensors = [SensorErrors(self.noise, seed=seed)] if any(self.noise) else []
+            plain = {"observation": "dict", "scale_actions": False, "transforms": sensors, "seed": seed, **options}
+            return make(len(tasks.start), scenario=self.scenario.with_tasks(tasks), **plain)
 
         if self.scenario.tasks is not None:
-            self._scenario_env = make(self.scenario, paper.TEST_SEED)
+            self._scenario_env = env_of(self.scenario.tasks, paper.TEST_SEED)
         sets = (self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED)
-        random = (make(self.scenario.with_tasks(self.scenario.random_tasks(count, seed)), seed) for count, seed in sets)
-        validation, test = random
+        validation, test = (env_of(self.scenario.random_tasks(count, seed), seed) for count, seed in sets)
         return validation, test
 
     # Parts

@@ -106,6 +106,11 @@ class _View:
     max_leg_km: float
     max_turn_rad: float
 
+    @property
+    def geometry(self) -> bool:
+        """Whether :class:`~magrl.agents.networks.AreaGeometry` reads the observation."""
+        return False
+
     def __post_init__(self) -> None:
         check_number(0, above=True, max_leg_km=self.max_leg_km)
         check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
@@ -179,6 +184,11 @@ class ObservationView(_View):
     def size(self) -> int:
         """Number of entries of ``observation``."""
         return 8 + 3 * self.observe_difference + 2 * self.observe_heading + 3 * SEEN * self.observe_areas
+
+    @property
+    def geometry(self) -> bool:
+        """Whether :class:`~magrl.agents.networks.AreaGeometry` reads the observation: areas, and all else."""
+        return self.observe_areas and self.observe_heading and self.observe_difference
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys to ``observation`` ``(..., size)``."""

@@ -22,9 +22,9 @@ from torchrl.envs import Compose, TransformedEnv
 import magrl
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, geomagnetic, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
-from magrl.envs.navigation import NAMED_ENVS, anywhere_env
 from magrl.evaluation import episode_measures
 from magrl.field import elements_at
+from magrl.named_tasks import NAMED_TASKS, anywhere_env
 from magrl.tracking.observation import OBSERVATION_SIZE
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorErrors, TargetDifference
 
@@ -147,8 +147,8 @@ def test_tasks_on_planets_end_by_distance() -> None:
     """Unless a scenario says otherwise; those of the paper's region end by its rule."""
     planets = planet_scenario(1, seed=0)
     for task in ("anywhere", "readings", "storm"):
-        assert NAMED_ENVS[task](1, scenario=planets).arrival == "distance"
-    assert NAMED_ENVS["storm"](1, scenario=planets.replace(arrival="objective")).arrival == "objective"
+        assert NAMED_TASKS[task].make(1, scenario=planets).arrival == "distance"
+    assert NAMED_TASKS["storm"].make(1, scenario=planets.replace(arrival="objective")).arrival == "objective"
 
 
 @pytest.mark.parametrize("task", ["readings", "storm"])

@@ -19,10 +19,10 @@ from torchrl.modules import LSTMModule
 from magrl import load_policy, save_policy, score
 from magrl.agents.onnx_policy import with_description
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
-from magrl.envs.navigation import NAMED_ENVS, navigation_env
+from magrl.envs.navigation import navigation_env
 from magrl.evaluation.scores import SEED, flown, scored
+from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import Secant
-from magrl.registry import NAMED_TASKS
 
 
 class Toward(nn.Module):
@@ -185,7 +185,7 @@ def test_the_state_of_a_function_is_passed_on(wanted: dict[str, float]) -> None:
 
 def test_a_recurrent_policy_of_torchrl_keeps_its_memory() -> None:
     torch.manual_seed(0)
-    size = NAMED_ENVS["readings"]().observation_spec["observation"].shape[-1]
+    size = NAMED_TASKS["readings"].make().observation_spec["observation"].shape[-1]
     memory = LSTMModule(size, 8, in_key="observation", out_key="seen")
     head = nn.Sequential(nn.Linear(8, 2), nn.Tanh())
     policy = TensorDictSequential(memory, TensorDictModule(head, ["seen"], ["action"]))

@@ -20,9 +20,9 @@ from torchrl.modules import LSTMModule
 from magrl import FieldPolicy
 from magrl.agents import PolicyConfig
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import NAMED_ENVS
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.navigators import make_navigator
+from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import NAVIGATORS, Secant, policy_env
 from magrl.navigators.metaheuristics import Metaheuristic
 
@@ -48,7 +48,7 @@ def plain(seed: int, **options: Any) -> GeomagneticNavEnv:
 
 
 def named(task: str, **options: Any) -> Callable[[int], EnvBase]:
-    return lambda seed: NAMED_ENVS[task](5, seed=seed, max_steps=7, **options)
+    return lambda seed: NAMED_TASKS[task].make(5, seed=seed, max_steps=7, **options)
 
 
 def region_policy() -> FieldPolicy:

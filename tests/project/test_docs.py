@@ -26,8 +26,8 @@ import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
-from magrl.envs.navigation import NAMED_ENVS
-from magrl.registry import NAMED_TASKS
+from magrl.files import read_document
+from magrl.named_tasks import NAMED_TASKS
 from magrl.transforms import CONDITIONS
 
 bars, flights, publish = (load(f"docs/tables/{name}") for name in ("bars", "flights", "publish"))
@@ -279,7 +279,7 @@ def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> Non
     assert len(table) == len(NAMED_TASKS)
     for name, (*_, spl, earned, trained, own) in table.items():
         task = name.split("-")[0].lower() or "box"
-        agent = bars.BARS[NAMED_TASKS[task].reference]
+        agent = bars.BARS[bars.TASKS[task].reference]
         assert re.search(rf"^\| {task} \| {re.escape(agent)} \|.*\| {earned} \|.*\| {spl} \|$", scores, re.MULTILINE), (
             name
         )
@@ -291,21 +291,33 @@ def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> Non
 
 
 @pytest.mark.parametrize("name", NAMED_TASKS)
-def test_a_named_task_is_a_function_a_row_and_a_section(name: str, monkeypatch) -> None:
+def test_a_named_task_is_a_function_and_a_section(name: str, monkeypatch) -> None:
     """The page has its id, steps and arrival, and lists its observation by index, or names the task with the same."""
-    monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
+    monkeypatch.setattr("magrl.named_tasks._planets", lambda: planet_scenario(4, seed=0))
     task, page = NAMED_TASKS[name], TEXTS[ROOT / "docs/tasks.md"]
-    env, table = NAMED_ENVS[name](seed=0), rows("# Named tasks", "id, after `magrl/GeomagneticNavigation`", page)
+    env, table = task.make(seed=0), rows("# Named tasks", "id, after `magrl/GeomagneticNavigation`", page)
     (row,) = [row for cell, row in table.items() if cell.endswith(f"(#{name})" + " (*Box*)" * (name == "box"))]
     arrival = "within 25 km" if env.arrival == "distance" else "F < 0.01"
-    assert row[:3] == [f"`{task.make}`", str(env.max_steps), arrival]
+    assert row[:3] == [f"`{task.make.__name__}`", str(env.max_steps), arrival]
     assert f"[`{task.id.removeprefix('magrl/GeomagneticNavigation')}`](#{name})" in page
     assert gymnasium.spec(task.id).reward_threshold == task.threshold
     text = page.partition(f"\n## {task.title}\n\n")[2].partition("\n## ")[0]
     listed = re.findall(r"^\| (\d[\d–, ]*) \|", text, re.MULTILINE)
     ends = [[int(end) for end in part.split("–")] for row in listed for part in row.split(", ")]
-    sizes = range(13 if "NoGoAreas" in task.transforms else 0, env.observation_spec["observation"].shape[-1])
+    sizes = range(
+        13 if hasattr(env, "view") and "areas" in env.view.in_keys else 0, env.observation_spec["observation"].shape[-1]
+    )
     assert list(chain(*(range(part[0], part[-1] + 1) for part in ends))) == list(sizes) or text.startswith("*Readings*")
+
+
+def test_the_recipe_of_several_tasks_knows_none() -> None:
+    """Their settings are its presets, which are data."""
+    script, data = ROOT / "recipes/td3_gradient_guided.py", read_document(ROOT / "recipes/presets.toml")
+    tree = ast.parse(script.read_text(encoding="utf-8"))
+    tree.body = tree.body[1:]  # the examples of the command
+    trained = {table.get("task") for table in data[script.stem].values()} - {None}
+    assert len(trained) == 3
+    assert re.findall("|".join({*NAMED_TASKS} | trained), ast.unparse(tree), re.IGNORECASE) == []
 
 
 def test_no_code_lists_the_named_tasks_again() -> None:

@@ -8,6 +8,7 @@ import random
 import re
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import ppo_anywhere
@@ -19,8 +20,8 @@ from support.paths import with_paths
 from support.recipes import ROOT, small
 from tensordict import TensorDict
 
-from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, load_policy, paper, planet_scenario
-from magrl.envs.navigation import eddies_env, no_go_env
+from magrl import GeomagneticNavEnv, Scenario, evaluate, evaluation_rollout, load_policy, paper, planet_scenario
+from magrl.named_tasks import eddies_env, no_go_env
 from magrl.navigators import policy_env
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
@@ -37,12 +38,11 @@ def names(module) -> str:
 def few_steps(monkeypatch, max_steps: int, task: str = "nogo") -> None:
     """Give a task another deadline."""
     row = recipe.NAMED_TASKS[task]
-    monkeypatch.setitem(recipe.NAMED_TASKS, task, row._replace(options={**row.options, "max_steps": max_steps}))
+    monkeypatch.setitem(recipe.NAMED_TASKS, task, row._replace(make=partial(row.make, max_steps=max_steps)))
 
 
 def test_the_return_is_the_sum_of_its_terms() -> None:
-    base = GeomagneticNavEnv(num_envs=2, seed=0)
-    after = recipe.make_env(base, base.observation_view(), recipe.Config()).rollout(4)["next"]
+    after = recipe.make_env(Scenario(), recipe.Config(num_envs=2)).rollout(4)["next"]
     terms = sum(after[f"episode_reward_{term}"] for term in RETURN_TERMS)
     torch.testing.assert_close(terms, after["episode_reward"], rtol=1e-5, atol=1e-4)
 
@@ -99,7 +99,7 @@ def test_a_task_takes_its_preset_unless_another_is_given() -> None:
 def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatch) -> None:
     """Its policy sees areas in training and evaluation, and flies where there are some."""
     few_steps(monkeypatch, 4)
-    recipe.train(small(recipe, tmp_path / "run", task="nogo", total_frames=64, eval_every=4))
+    recipe.train(small(recipe, tmp_path / "run", task="nogo", reward="progress", total_frames=64, eval_every=4))
     assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
     rows, _ = outcome(tmp_path / "run")
     assert all(math.isnan(float(rows[-1][f"return_{term}"])) for term in RETURN_TERMS[:2])  # not parts of the reward
@@ -120,11 +120,12 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
 def test_training_in_eddies(tmp_path: Path, monkeypatch) -> None:
     """Its policy gets its last legs from the map of any environment of one region, and acts as in training."""
     few_steps(monkeypatch, 8, "eddies")
-    options = {"total_frames": 64, "eval_every": 4, "eval_tasks": 2, "eval_tasks_small": 2}
+    options = {"reward": "progress", "total_frames": 64, "eval_every": 4, "eval_tasks": 2, "eval_tasks_small": 2}
     recipe.train(small(recipe, tmp_path / "run", task="eddies", **options))
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
-    assert policy.view == eddies_env(seed=0).view
-    plain, own = eddies_env(8, observation="dict", scale_actions=False, seed=1), eddies_env(8, seed=1)
+    make = partial(eddies_env, 8, max_steps=8, seed=1)
+    assert policy.view == make().view
+    plain, own = make(observation="dict", scale_actions=False), make()
     flown = policy_env(plain, policy).rollout(5, policy, break_when_any_done=False)
     trained = own.rollout(5, policy.actor, break_when_any_done=False)
     assert torch.equal(flown["next", "recent_legs"], trained["next", "observation"])
@@ -154,7 +155,7 @@ def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys, m
     """The first episodes end before the replay buffer holds a batch; progress is shown in episodes."""
     few_steps(monkeypatch, 10)
     options = {"total_episodes": 1, "total_frames": 88, "batch_size": 85, "num_envs": 4, "zeta": 1e-12}
-    result = recipe.train(small(recipe, tmp_path, task="nogo", **options))
+    result = recipe.train(small(recipe, tmp_path, task="nogo", reward="progress", **options))
     text = capsys.readouterr()
     assert "episode/s" in text.err
     assert f"Warning: no gradient step was made in {result['frames']} frames" in text.err
@@ -165,8 +166,7 @@ def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys, m
 
 def first_state(noise: tuple[float, ...]) -> TensorDict:
     """Return the first observation of a recipe's training environment."""
-    config, base = recipe.Config(noise=noise), GeomagneticNavEnv(num_envs=4, seed=5)
-    return recipe.make_env(base, base.observation_view(), config).reset()
+    return recipe.make_env(Scenario(), recipe.Config(noise=noise, num_envs=4, seed=5)).reset()
 
 
 def test_noise_is_observed_and_the_guidance_is_by_the_truth() -> None:

@@ -33,7 +33,7 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     chosen = sweep.ALGORITHMS[name]
     settings = chosen.settings | {"n_steps": 2, "batch_size": 16}
     monkeypatch.setitem(sweep.ALGORITHMS, name, chosen._replace(num_envs=8, settings=settings))
-    monkeypatch.setitem(sweep.NAMED_TASKS, task, sweep.NAMED_TASKS[task]._replace(budget={name: 0.032}))
+    monkeypatch.setitem(sweep.TASKS, task, sweep.TASKS[task]._replace(budget={name: 0.032}))
     job = (sweep.Config(out=tmp_path), task, name, 0)
     rows = read_csv(sweep.run(job[0], job[1:]))
     assert rows["steps"].tolist() == [8, 16, 32, 32]

@@ -15,6 +15,7 @@ from torchrl.collectors import Collector
 
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.navigation import navigation_env
 from magrl.files import locked
 from magrl.training import RegionConfig, Run, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints
@@ -37,7 +38,7 @@ def train(folder: Path, width: int = 1, **options: object) -> None:
     with in_run(RegionConfig(out=folder, wandb_mode="disabled", **options)) as run:
         torch.manual_seed(run.config.seed)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=2, seed=0, max_steps=2)
-        validation, test = run.evaluation_envs(max_steps=2, zeta=2.9)
+        validation, test = run.evaluation_envs(navigation_env, max_steps=2, zeta=2.9)
         policy = FieldPolicy(PolicyConfig(base.observation_view(), (8,)))
         collector = Collector(base, base.rand_action, frames_per_batch=2, total_frames=12, track_traj_ids=False)
         run.start(policy=policy, validation=validation, env=base, collector=collector, part=nn.Linear(width, 1))
@@ -92,7 +93,7 @@ def test_run_is_named_after_its_scenario_and_noise() -> None:
 def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
     for noise, share in ((NOISE, 1.0), ((0.0, 0.0, 0.0), 0.0)):
         with in_run(RegionConfig(out=tmp_path / f"run{share}", noise=noise, eval_tasks=6, eval_tasks_small=4)) as run:
-            states = [env.reset() for env in run.evaluation_envs(zeta=0.01)]
+            states = [env.reset() for env in run.evaluation_envs(navigation_env, zeta=0.01)]
         errors = [state["field"] - state.get("true_field", state["field"]) for state in states]
         assert [(error != 0).double().mean().item() for error in errors] == [share, share]
         assert not share or not torch.equal(errors[0], errors[1][:4])

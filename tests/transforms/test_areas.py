@@ -9,9 +9,10 @@ from torchrl.envs import CatTensors, Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import no_go_env
+from magrl.envs.navigation import guidance
 from magrl.evaluation.navigators import make_navigator
 from magrl.geodesy import geodesic, move_place
+from magrl.named_tasks import no_go_env
 from magrl.transforms import NoGoAreas, TrueDisplacement
 from magrl.transforms.areas import NUMBER, distance_km, outlines, turned
 
@@ -92,7 +93,7 @@ def test_areas_join_the_observation_alone() -> None:
 
 
 def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused() -> None:
-    for reward in ("paper", "base"):
+    for reward in ("paper", "base", guidance):
         with pytest.raises(ValueError, match="reward"):
             no_go_env(reward=reward)
 

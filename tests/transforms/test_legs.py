@@ -12,10 +12,10 @@ from torch.testing import assert_close
 from torchrl.envs import Compose, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions
-from magrl.envs.navigation import eddies_env
 from magrl.field.model import elements_at
 from magrl.field.spherical import SphericalHarmonicField
 from magrl.geodesy import geodesic
+from magrl.named_tasks import eddies_env
 from magrl.transforms import Fix, MotionError, RecentLegs
 
 BASE = paper_env(1)

@@ -10,9 +10,9 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase, SerialEnv
 
 from magrl.counters import advanced, counter_stream
-from magrl.envs.navigation import anywhere_env
 from magrl.envs.random_regions import planet_scenario
 from magrl.geodesy import geodesic
+from magrl.named_tasks import anywhere_env
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors, TargetErrors
 from magrl.transforms.errors.base import gauss_markov
