@@ -25,7 +25,10 @@ class ArrayPolicy(Navigator):
     """A function of arrays as a policy, which gets the observation and the state that it returned before.
 
     Args:
-        act: function; its state is None at the start of an episode.
+        act: function; its state is None at the start of an episode, then arrays ``(N, ...)`` or a tree of them.
+
+    Raises:
+        ValueError: for actions or a state of another shape.
 
     Example:
         >>> from magrl.envs.navigation import navigation_env
@@ -43,7 +46,7 @@ class ArrayPolicy(Navigator):
     def __init__(self, act: Act) -> None:
         super().__init__()
         self.act = act
-        self._form: tuple[list[tuple[bool, int]], Any] = [], None  # of a state: kinds and axes of its arrays, and tree
+        self._form: tuple[list[bool], Any] = [], None  # of a state: which of its arrays are tensors, and their tree
 
     def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:  # noqa: ARG002
         """Return the memory of its state, if it has one, in the form of that after a first step of zeros."""
@@ -70,16 +73,15 @@ class ArrayPolicy(Navigator):
         given = None if memory is None else self._state(memory)
         actions, state = self.act(np.array(seen.cpu().numpy()), given, np.full(count, memory is None))
         arrays, tree = ([], None) if state is None else tree_flatten(state)
-        axes = [_axis_of(array, count) for array in arrays]
-        self._form = [(isinstance(array, Tensor), axis) for array, axis in zip(arrays, axes, strict=True)], tree
-        rows = [torch.as_tensor(array).movedim(axis, 0) for array, axis in zip(arrays, axes, strict=True)]
-        return _checked(actions, count).to(seen.device), {str(number): row for number, row in enumerate(rows)}
+        self._form = [isinstance(array, Tensor) for array in arrays], tree
+        rows = {str(number): _rows(array, count) for number, array in enumerate(arrays)}
+        return _checked(actions, count).to(seen.device), rows
 
     def _state(self, memory: TensorDictBase) -> Any:
         """Return a state in the form that the function returned it."""
-        kinds, tree = self._form
-        arrays = [memory[str(number)].movedim(0, axis) for number, (_, axis) in enumerate(kinds)]
-        return tree_unflatten([a if tensor else a.numpy() for a, (tensor, _) in zip(arrays, kinds, strict=True)], tree)
+        tensors, tree = self._form
+        rows = (memory[str(number)] for number in range(len(tensors)))
+        return tree_unflatten([a if tensor else a.numpy() for a, tensor in zip(rows, tensors, strict=True)], tree)
 
 
 def _checked(actions: Any, count: int) -> Tensor:
@@ -94,10 +96,13 @@ def _checked(actions: Any, count: int) -> Tensor:
     return torch.from_numpy(rounded)
 
 
-def _axis_of(array: Any, count: int) -> int:
-    """Return the axis of the vehicles of an array in a state, the first or the second one."""
+def _rows(array: Any, count: int) -> Tensor:
+    """Return an array of a state as a tensor ``(count, ...)``; raise for another layout."""
     shape = tuple(getattr(array, "shape", ()))
-    if count not in shape[:2]:
-        wanted = f"arrays with {count} vehicles on their first or second axis"
-        raise ValueError(f"a state must be None or hold {wanted}, got {short(array)}")
-    return shape.index(count)
+    if shape[:1] != (count,):
+        got = f"the shape {shape}" if shape else short(array)
+        raise ValueError(
+            f"a state must be None or hold arrays with the {count} vehicles on the first axis, got {got}: of (layers, "
+            "N, ...), return state.movedim(1, 0), and take state.movedim(0, 1).contiguous()"
+        )
+    return torch.as_tensor(array)

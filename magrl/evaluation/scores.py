@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
+from torch.utils._pytree import tree_map
 
 from magrl import paper
 from magrl.agents.onnx_policy import OnnxNetwork, has_view
@@ -45,7 +46,7 @@ def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
             - a model of stable-baselines3, or what else has their ``predict``;
             - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
               ``act(observations, state)`` returns actions and the next state, which is None at the start: arrays with
-              the vehicles on their first or second axis, or a tuple, list or dict of them. It gets no other key.
+              the vehicles on their first axis, or a tuple, list or dict of them. It gets no other key.
         task: name or id of a task in :data:`magrl.named_tasks.NAMED_TASKS`: ``"nogo"``, or
             ``"magrl/GeomagneticNavigationNoGo-v0"``.
         episodes: vehicles, each with one episode.
@@ -109,7 +110,7 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
     if isinstance(agent, TensorDictModuleBase):
         return agent
     if hasattr(agent, "predict"):
-        return ArrayPolicy(lambda seen, state, first: agent.predict(seen, state, first, deterministic=True))
+        return ArrayPolicy(partial(_predicted, agent))
     if isinstance(agent, nn.Module):
         for weight in agent.parameters():
             if weight.is_floating_point() and weight.dtype != torch.float32:
@@ -121,6 +122,13 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
     if _takes_state(agent):
         return ArrayPolicy(lambda seen, state, _: agent(seen, state))
     return ArrayPolicy(lambda seen, *_: (agent(seen), None))
+
+
+def _predicted(model: Any, seen: Any, state: Any, first: Any) -> tuple[Any, Any]:
+    """Return actions and next state of a model of stable-baselines3, whose states are ``(layers, N, ...)``."""
+    turned = partial(tree_map, lambda array: None if array is None else array.swapaxes(0, 1))
+    actions, state = model.predict(seen, turned(state), first, deterministic=True)
+    return actions, turned(state)
 
 
 def _takes_state(act: Callable[..., Any]) -> bool:

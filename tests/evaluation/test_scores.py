@@ -183,6 +183,33 @@ def test_the_state_of_a_function_is_passed_on(wanted: dict[str, float]) -> None:
     assert late["SPL"] == pytest.approx(wanted["SPL"], rel=1e-3)
 
 
+def test_a_state_has_the_vehicles_on_the_first_axis() -> None:
+    """That of torch's GRU, (layers, N, H), is refused with the line that brings it in order; a model's is known."""
+    torch.manual_seed(0)
+    gru = nn.GRU(13, 2, num_layers=2)
+
+    def layered(observations: np.ndarray, state: Tensor | None) -> tuple[np.ndarray, Tensor]:
+        with torch.no_grad():
+            seen, state = gru(torch.from_numpy(observations)[None], state)
+        return seen[0].numpy(), state
+
+    def ordered(observations: np.ndarray, state: Tensor | None) -> tuple[np.ndarray, Tensor]:
+        actions, state = layered(observations, None if state is None else state.movedim(0, 1).contiguous())
+        return actions, state.movedim(1, 0)
+
+    def predict(seen: np.ndarray, state: Any, *_: Any, **__: Any) -> tuple[np.ndarray, np.ndarray]:
+        actions, state = layered(seen, None if state is None else torch.tensor(state))
+        return actions, state.numpy()
+
+    message = r"vehicles on the first axis, got the shape \(2, 3, 2\): .* return state.movedim\(1, 0\), and take "
+    with pytest.raises(ValueError, match=message + r"state.movedim\(0, 1\).contiguous\(\)"):
+        score(layered, "box", episodes=3)
+    with pytest.raises(ValueError, match="vehicles on the first axis, got 5"):
+        score(lambda observations, state: (observations[:, :2], state or 5), "box", episodes=3)
+    whole, model = (score(agent, "box", episodes=3) for agent in (ordered, SimpleNamespace(predict=predict)))
+    assert whole["return"] == pytest.approx(model["return"])
+
+
 def test_a_recurrent_policy_of_torchrl_keeps_its_memory() -> None:
     torch.manual_seed(0)
     size = NAMED_TASKS["readings"].make().observation_spec["observation"].shape[-1]
@@ -192,8 +219,9 @@ def test_a_recurrent_policy_of_torchrl_keeps_its_memory() -> None:
 
     def act(observations: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
         with torch.no_grad():
-            seen, state = memory.lstm(torch.from_numpy(observations)[:, None], state)
-            return head(seen[:, 0]).numpy(), state
+            before = None if state is None else tuple(part.movedim(0, 1).contiguous() for part in state)
+            seen, state = memory.lstm(torch.from_numpy(observations)[:, None], before)
+            return head(seen[:, 0]).numpy(), tuple(part.movedim(1, 0) for part in state)
 
     scores = score(policy, "readings", episodes=4, max_steps=5)
     assert scores["return"] == pytest.approx(score(act, "readings", episodes=4, max_steps=5)["return"], rel=1e-5)

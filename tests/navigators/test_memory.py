@@ -37,10 +37,10 @@ def recurrent() -> TensorDictModuleBase:
 
 
 def act(observations: np.ndarray, state: Any, _: np.ndarray) -> tuple[np.ndarray, Any]:
-    """Steps and a sum of observations as action; the vehicles are on the second axis of the first part."""
-    count, total = state or (np.zeros((1, len(observations))), torch.zeros(len(observations)))
+    """Steps and a sum of observations as action; the state is an array and a tensor."""
+    count, total = state or (np.zeros((len(observations), 1)), torch.zeros(len(observations)))
     total = total + torch.from_numpy(observations[:, :2]).sum(-1)
-    return np.stack((count[0] / 10, np.tanh(total.numpy())), 1), (count + 1, total)
+    return np.stack((count[:, 0] / 10, np.tanh(total.numpy())), 1), (count + 1, total)
 
 
 def plain(seed: int, **options: Any) -> GeomagneticNavEnv:
