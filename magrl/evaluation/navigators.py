@@ -41,6 +41,8 @@ PRETRAINED = {"eddies": _EDDIES}
 """Agents that ship as files of :func:`magrl.save_policy`, by name."""
 KINDS: dict[str, Kind] = {"gg_td3": _GUIDED, "td3": _PLAIN, **NAVIGATORS, **PRETRAINED}
 """What navigators are, by their names in results: the paper's agents, and navigators that commands name."""
+NAMES = (*NAVIGATORS, *PRETRAINED)
+"""Navigators that commands name."""
 
 
 class Named(NamedTuple):
@@ -80,10 +82,9 @@ def named(text: str) -> Named:
     label, _, path = ("", "", text) if _exists(text) or "=" not in text else text.partition("=")
     if label in KINDS:
         raise ValueError(f"{short(text)}: the name {label} follows from a file: leave it out, or choose another label")
-    known = (*NAVIGATORS, *PRETRAINED)
     if path == text and not (_exists(path) or "/" in path or path.endswith((".safetensors", ".onnx"))):
-        raise ValueError(f"unknown navigator {short(text)}: choose from {', '.join(known)}, or [LABEL=]PATH")
-    kind = _kind_of(file := policy_file(path))
+        raise ValueError(f"unknown navigator {short(text)}: choose from {', '.join(NAMES)}, or [LABEL=]PATH")
+    kind, _ = _agent_of(file := policy_file(path))
     if label:
         kind = Agent(label, label, label, kind.trained_on, kind.needs)
     return Named(kind, Path(path), file)
@@ -105,23 +106,29 @@ def policy_file(source: Path | str) -> Path:
     return path
 
 
-def _kind_of(file: Path) -> Kind:
-    """Return what the file of a policy says of its agent."""
+def _agent_of(file: Path) -> tuple[Kind, dict[str, Any]]:
+    """Return what the file of a policy says of its agent, and of its training, which evaluations share.
+
+    ONNX files say nothing of their training.
+    """
     if not _exists(str(file)):
         raise FileNotFoundError(f"there is no policy file at {printable(str(file))[:200]}")
     if file.suffix == ".zip":
         raise ValueError(f"{file} is a model of stable-baselines3: load it, as PPO.load(path), and pass the model")
-    content = _content_of(file)
-    if content.kind in ("pilot", "memory"):
-        return Anywhere if content.kind == "pilot" else Memory
-    training = _training(file, content)
-    if training.get("guided") is None:
-        return Agent(*[file.parent.name if file.stem == "policy" else file.stem] * 3)
-    agent = _GUIDED if training["guided"] else _PLAIN
-    if any(training.get("noise", ())):
+    content = PolicyFile("onnx", {}, {}) if file.suffix == ".onnx" else read_policy(file)
+    if content.kind == "pilot":
+        return Anywhere, {"zeta": content.config["rules"]["zeta"]}
+    with reading(file):
+        training = TrainingSettings(**content.training).model_dump(exclude_unset=True)
+    guided, noise = training.pop("guided", None), training.pop("noise", None)
+    training |= {} if noise is None else {"errors": noise}
+    training |= {"scenario": file.parent / training["scenario"]} if training.get("scenario") else {}
+    agent = Agent(*[file.parent.name if file.stem == "policy" else file.stem] * 3)
+    if guided is not None:
+        agent = _GUIDED if guided else _PLAIN
         text = f"{agent.label}, trained with noise"
-        return agent._replace(name=f"{agent.name}_noise", label=text, description=text)
-    return agent
+        agent = agent._replace(name=f"{agent.name}_noise", label=text, description=text) if any(noise or ()) else agent
+    return Memory if content.kind == "memory" else agent, training
 
 
 def make_navigator(
@@ -191,7 +198,8 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
     settings = {name: value for name, value in chosen.items() if value is not None}
     fixed, others, notes = set(settings), dict[str, list[str]](), list[str]()
     for text in texts:
-        for name, value in _trained_with(text).items():
+        file = named(text).file
+        for name, value in (_agent_of(file)[1] if file else {}).items():
             if name == "task":
                 if value != "box":
                     notes.append(f"{text} was trained for {value}, and flies other tasks here: score it there")
@@ -204,32 +212,6 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
             others.setdefault(name, []).append(f"{value} ({text})")
     notes += [f"{name} is {settings[name]}, in training {', '.join(other)}" for name, other in others.items()]
     return settings, list(map(printable, notes))
-
-
-def _trained_with(text: str) -> dict[str, Any]:
-    """Return the settings in the file of a policy; none of a navigator without one."""
-    path = named(text).file
-    if path is None:
-        return {}
-    content = _content_of(path)
-    found = {"zeta": content.config["rules"]["zeta"]} if content.kind == "pilot" else _training(path, content)
-    found.pop("guided", None)
-    if "noise" in found:
-        found["errors"] = tuple(found.pop("noise"))
-    if found.get("scenario"):
-        found["scenario"] = path.parent / found["scenario"]
-    return found
-
-
-def _content_of(path: Path) -> PolicyFile:
-    """Return what a file says of its policy; ONNX files say nothing of their training."""
-    return PolicyFile("onnx", {}, {}) if path.suffix == ".onnx" else read_policy(path)
-
-
-def _training(path: Path, content: PolicyFile) -> dict[str, Any]:
-    """Return the settings of a training in the file of its policy, checked."""
-    with reading(path):
-        return TrainingSettings(**content.training).model_dump(exclude_unset=True)
 
 
 def _content(value: Any) -> Any:
