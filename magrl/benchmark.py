@@ -21,7 +21,7 @@ from torch import Tensor
 
 from magrl import paper
 from magrl.envs import PUBLIC_KEYS, Scenario, Tasks, earth_scenario, named_tasks
-from magrl.evaluation import Flight
+from magrl.evaluation import Flight, Sheet
 from magrl.files import write_atomically
 from magrl.sensor_std import PERFECT, STD_KEYS, Noise
 from magrl.transforms import Conditions, conditions_named
@@ -61,10 +61,8 @@ class Track:
     """Legs after which an episode ends."""
     within_km: float | None = None
     """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
-    confidence: float = 0.0
-    """Minimum probability at which vehicles declare their arrival."""
-    north: str = "true"
-    """North of the vehicles, ``"true"`` or ``"magnetic"``."""
+    sheet: Sheet = Sheet()
+    """Data sheet of the vehicles, beside the errors of their sensors."""
     crust: bool = False
     """Whether the field is WMMHR, with crust, or IGRF-14."""
     box: bool = False
@@ -105,15 +103,16 @@ class Track:
             changes: options of :class:`~magrl.evaluation.Flight` that replace the track's.
         """
         scenario = self.scenario if tasks is None else self.scenario.with_tasks(tasks)
-        options = {name: getattr(self, name) for name in ("north", "confidence", "seed")}
-        return Flight(scenario, errors=errors, **options | changes)
+        return Flight(scenario, **{"sheet": self.sheet, "errors": errors, "seed": self.seed} | changes)
 
     def record(self) -> dict[str, Any]:
         """Return the declaration of the track as plain data, and the digest of its tasks."""
         ends = self.scenario.tasks
         assert ends is not None
         fixed = {"levels": self.levels or LEVELS, "known_start": None}  # a key of the first declarations
-        declared: dict[str, Any] = json.loads(json.dumps(asdict(self) | fixed))
+        known = self.sheet.model_dump(include={"north", "confidence"}) | self.sheet.model_dump(exclude_unset=True)
+        declared: dict[str, Any] = json.loads(json.dumps(asdict(self) | fixed | known | {"sheet": None}))
+        del declared["sheet"]
         if not self.crust:  # as the first tracks were declared
             del declared["crust"]
         return declared | {"tasks_sha256": digest(torch.cat((*ends[:2], ends.region.unsqueeze(-1)), -1))}
@@ -144,9 +143,12 @@ TRACKS = {
     "box-v2": Track(box=True, levels=(PERFECT.noise, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))),
     "earth-v2": Track(tasks=2000),
     "alone-v2": Track(within_km=25, max_steps=80),
-    "vehicles-v3": Track(tasks=300, within_km=25, max_steps=120, confidence=0.8, conditions=VEHICLES),
+    "vehicles-v3": Track(tasks=300, within_km=25, max_steps=120, sheet=Sheet(confidence=0.8), conditions=VEHICLES),
     "north-v1": Track(
-        within_km=25, max_steps=80, north="magnetic", levels=(PERFECT.noise, (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))
+        within_km=25,
+        max_steps=80,
+        sheet=Sheet(north="magnetic"),
+        levels=(PERFECT.noise, (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)),
     ),
 }
 """Tracks by name and version. Published numbers rest on them: for a change, add a track with the next version."""

@@ -270,6 +270,10 @@ class CheckedModel(BaseModel):
         """Return a copy with other values, validated again; what was not given keeps its default."""
         return type(self)(**{name: getattr(self, name) for name in self.model_fields_set} | values)
 
+    def taking(self, options: dict[str, Any]) -> Self:
+        """Return a copy with those of its fields that are among some options, which are taken out of them."""
+        return self.replace(**{name: options.pop(name) for name in type(self).model_fields if name in options})
+
     @classmethod
     def _sentence(cls, item: Any) -> str:
         name, kind, value = ".".join(map(str, item["loc"])), item["type"], short(item["input"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +20,8 @@ OUTAGE_STD = 1e4
 """Standard deviation of a repeated reading, in the unit of each element: a filter ignores it."""
 Noise = tuple[float, float, float]
 """Standard deviations of white noise on D [deg], I [deg], B_H [nT]."""
+North = Literal["true", "magnetic"]
+"""North of a vehicle: of its headings, and of D, which is measured from true north alone."""
 _NONE: Noise = (0.0, 0.0, 0.0)
 
 

@@ -27,18 +27,17 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 from magrl.envs import load_scenario, named_tasks
 from magrl.envs.scenario import RULES
-from magrl.evaluation import Flight, episode_measures, summarize
+from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.navigators import Kind, check_distinct, named, training_settings
+from magrl.evaluation.navigators import NAMES, Kind, check_distinct, named, training_settings
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json, write_text, write_with
-from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
 
@@ -47,10 +46,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from tqdm import tqdm
+from typing_extensions import Doc
 
 RECIPE = "evaluate.py"
 SHOWN = 24
 """Number of tasks in trajectories.png."""
+FILES = "Trained agents and policies of any algorithm by run folder or file: PATH, or LABEL=PATH for one's own label."
 Pair = tuple[TensorDictModuleBase, ...]
 
 
@@ -61,32 +62,20 @@ def free_folder() -> Path:
 
 
 @dataclass(frozen=True)
-class Config(ScenarioOptions):
+class Config:
     """Settings of an evaluation."""
 
-    navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: anywhere, memory, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa.
-    Trained agents and policies of any algorithm by run folder or file: PATH, or LABEL=PATH for a label of its own."""
+    navigators: tyro.conf.Positional[Annotated[tuple[str, ...], Doc(f"Navigators: {', '.join(NAMES)}. {FILES}")]]
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
     """Seed of random tasks, disjoint from the tasks of trainings and of frozen sets; 0 by default."""
     scenario: Path | None = None
     """Scenario file (.toml or .json) of region, date and tasks (docs/data.md); by default the runs' or the paper's."""
-    errors: Noise | str | None = None
-    """White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle.
-    Vehicles are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (docs/results.md).
-    By default the noise of the runs, or 0."""
-    north: Literal["true", "magnetic"] = "true"
-    """North of the vehicles: true (they measure D), or magnetic (I and B_H alone), as for boat and drone."""
-    model: str | None = None
-    """Model of the Earth that vehicles carry, of the date: IGRF-14, IGRF-13, IGRF-2005, ...; none by default."""
-    start_km: float | None = None
-    """Error of the start as vehicles know it, with a model [km]; by default they do not know their start."""
-    target_std: Noise = (0.0, 0.0, 0.0)
-    """Errors of D [deg], I [deg], B_H [nT] at the destination (standard deviations); exact by default."""
-    confidence: float = 0.5
-    """Minimum estimated probability at which vehicles declare, with --arrival declared."""
+    rules: tyro.conf.OmitArgPrefixes[ScenarioOptions] = ScenarioOptions()
+    """Rules of the episodes and altitude; by default those of the scenario's file or of the trainings."""
+    sheet: tyro.conf.OmitArgPrefixes[Sheet] = Sheet(errors=None, confidence=0.5)
+    """Errors of the vehicles, and what they know."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
     device: str = "cpu"
@@ -123,14 +112,17 @@ def with_training_settings(config: Config) -> tuple[Config, list[str]]:
         ValueError: for trainings that differ in a setting that was not chosen.
         FileNotFoundError: for a missing file.
     """
-    chosen = {name: getattr(config, name) for name in ("scenario", "errors", "zeta", "start_heading")}
+    changes = config.rules.model_dump(exclude_none=True)
+    chosen = {name: changes.get(name) for name in ("zeta", "start_heading")}
+    chosen |= {"scenario": config.scenario, "errors": config.sheet.errors}
     if config.scenario:
-        own = load_scenario(config.scenario, **config.changes())
+        own = load_scenario(config.scenario, **changes)
         chosen |= {name: own.given(name) for name in ("zeta", "start_heading")}
     settings, notes = training_settings(config.navigators, **chosen)
     if config.tasks == "figure-4-1":  # which lies in the paper's region
         settings["scenario"] = config.scenario
-    return replace(config, **{"errors": PERFECT.noise} | settings), notes
+    known = {"rules": config.rules.taking(settings), "sheet": config.sheet.taking(settings)}
+    return replace(config, **known, **settings), notes
 
 
 def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]]:
@@ -148,10 +140,11 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
     try:
         check_distinct(config.navigators)
         config, notes = with_training_settings(config)
-        scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
+        changes = config.rules.model_dump(exclude_none=True)
+        scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **changes)
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        told = ("errors", "north", "model", "start_km", "target_std", "confidence", "seed", "device")
-        flights = [Flight(tasks, **{key: getattr(config, key) for key in told}) for tasks in (scenario, example)]
+        options = {"seed": config.seed, "device": config.device}
+        flights = [Flight(tasks, config.sheet, **options) for tasks in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
@@ -187,7 +180,7 @@ def evaluate(config: Config) -> str:
         if number == 0:
             results.rollouts[kind.description] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, example_flight.fly(example).cpu())
-    below = text_below(config, flight, notes)
+    below = text_below(flight, notes)
     write(config, flight, results, below)
     return short_table(results.summaries) + below
 
@@ -200,34 +193,19 @@ def settings(config: Config, flight: Flight) -> dict[str, Any]:
         "num_tasks": env.num_envs,
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
-        "north": north(flight),
-        **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "target_std", "confidence", "seed")},
-        "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
+        "tasks": config.tasks,
+        "seed": config.seed,
+        **flight.sheet.model_dump(),
         **env.scenario.model_dump(include={*RULES, "altitude_km"}),
     }
 
 
-def north(flight: Flight) -> str:
-    """Return the north of the vehicles, which errors of a real vehicle may decide."""
-    return "magnetic" if flight.sensor_std.magnetic else "true"
-
-
-def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
-    """Return what is written below a table: the errors of the vehicles, their rule of arrival, and notes."""
-    env = flight.base
-    text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
-    sure = f", at a probability of {config.confidence:g}" * env.scenario.declared
-    lines = {
-        "Arrival": env.arrival != "objective" and f"{env.arrival}, within {env.scenario.radius_km:g} km{sure}",
-        "North": north(flight) != "true" and north(flight),
-        "Conditions": isinstance(config.errors, str) and config.errors,
-        "Model of the Earth": config.model or "",
-        "Error of the known start": "" if config.start_km is None else f"{config.start_km:g} km",
-        "Errors of the elements at the destination": any(config.target_std) and text(*config.target_std),
-        "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
-    }
-    told = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
-    return told + "".join(f"\nNote: {note}.\n" for note in notes)
+def text_below(flight: Flight, notes: Sequence[str]) -> str:
+    """Return what is written below a table: the vehicles' rule of arrival, their data sheet, and notes."""
+    rules, known = flight.base.scenario, Sheet.lines(flight.sheet.model_dump())
+    sure = f", at a probability of {flight.sheet.confidence:g}" * rules.declared
+    arrival = [f"Arrival: {rules.arrival}, within {rules.radius_km:g} km{sure}"] * (rules.arrival != "objective")
+    return "".join(f"\n{line}.\n" for line in (*arrival, *known, *(f"Note: {note}" for note in notes)))
 
 
 def write(config: Config, flight: Flight, results: Results, below: str) -> None:

@@ -18,20 +18,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import places
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation import Flight, episode_measures
+from magrl.evaluation import Flight, Sheet, episode_measures
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.navigators import named
+from magrl.evaluation.navigators import NAMES, named
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
 from magrl.tracking.displacement import Displacement
 from magrl.training import UsageError, command, parse
-from magrl.transforms import conditions_named
 
 import torch
 import tyro
@@ -41,12 +40,11 @@ from torch import Tensor
 from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 from tqdm import tqdm
+from typing_extensions import Doc
 
 RECIPE = "fly.py"
 RULES = {"with_signal": "objective", "without_signal": "declared"}
 """Rules of arrival of the two flights: with an arrival signal, and declared by the vehicle within 25 km."""
-TOLD = ("target_std", "errors", "north", "model", "start_km", "confidence", "seed")
-"""Settings that a flight is given as they are."""
 ARRIVAL_KM = 400.0
 """Distance up to which the arrival threshold is 0.01; beyond, it decreases so that the arrival radius is constant."""
 
@@ -59,21 +57,9 @@ class Config:
     """Start, such as "60.4N 5.3E", "60.4, 5.3" or "-33.9 18.4"."""
     destination: tyro.conf.Positional[str]
     """Destination, such as a start."""
-    navigator: str = "anywhere"
-    """Navigator: anywhere (pretrained), kalman, secant, ..., or a run folder or file, as in evaluate.py."""
-    errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
-    """White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle.
-    Vehicles are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (docs/results.md)."""
-    north: Literal["true", "magnetic"] = "true"
-    """North of the vehicle: true (it measures D), or magnetic (I and B_H alone), as for boat and drone."""
-    model: str | None = None
-    """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
-    start_km: float | None = None
-    """Error of the start as the vehicle knows it, with a model [km]; by default it does not know its start."""
-    target_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Errors of D [deg], I [deg], B_H [nT] at the destination (standard deviations); exact by default."""
-    confidence: float = 0.5
-    """Minimum estimated probability at which the vehicle declares its arrival."""
+    navigator: Annotated[str, Doc(f"Navigator: {', '.join(NAMES)}, or a run folder or file.")] = "anywhere"
+    sheet: tyro.conf.OmitArgPrefixes[Sheet] = Sheet(confidence=0.5)
+    """Errors of the vehicle, and what it knows."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
@@ -133,8 +119,8 @@ def check_files(config: Config) -> None:
         check_writable(config.out / name)
 
 
-def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
-    """Return environment and navigator of a vehicle with an arrival signal and without.
+def prepare(config: Config) -> dict[str, tuple[Flight, EnvBase, Watched]]:
+    """Return flight, environment and navigator of a vehicle with an arrival signal and without.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -143,7 +129,7 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
     try:
         if config.start_heading != "random":
             check_number(-360, 360, start_heading=config.start_heading)
-        drift_km = conditions_named(config.errors).drift_km(50.0) if isinstance(config.errors, str) else 0.0
+        drift_km = config.sheet.conditions.drift_km(50.0)
         field = IGRF(config.date)
         start, target, distance_km = ends(config, field)
         region = places.region_around(start, target, field, 50.0 + drift_km)
@@ -153,14 +139,15 @@ def prepare(config: Config) -> dict[str, tuple[EnvBase, Watched]]:
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
-                **{key: getattr(config, key) for key in TOLD},
+                config.sheet,
+                seed=config.seed,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
                 arrival=arrival,
             )
             navigator = flight.navigator(config.navigator)
-            flights[name] = flight.env_of(navigator, track=True), Watched(navigator, distance_km)
+            flights[name] = flight, flight.env_of(navigator, track=True), Watched(navigator, distance_km)
         check_files(config)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
@@ -221,41 +208,38 @@ def fly(config: Config) -> dict[str, Any]:
     """
     torchrl_logger.setLevel("WARNING")
     flights = prepare(config)
-    steps = {name: rollout(env, navigator, config.start_heading) for name, (env, navigator) in flights.items()}
+    steps = {name: rollout(env, navigator, config.start_heading) for name, (_, env, navigator) in flights.items()}
     measures = {
         name: {"outcome": outcome(flight)} | {key: value[0].item() for key, value in episode_measures(flight).items()}
         for name, flight in steps.items()
     }
-    base, first = flights["with_signal"][0].base_env, steps["with_signal"][0, 0]
+    flight, first = flights["with_signal"][0], steps["with_signal"][0, 0]
     last = steps["without_signal"]["next"][0, -1]
     kind, estimated = named(config.navigator).kind, Displacement(**last["track", "displacement"])
     result = {
-        **{key: value for key, value in asdict(config).items() if key != "out"},
+        **{key: value for key, value in asdict(config).items() if key not in ("sheet", "out")},
+        **flight.sheet.model_dump(),
         "navigator": kind.name,
-        "north": "true" if first.get("true_target_field", None) is None else "magnetic",  # also of a preset
         "needs": kind.needs,
-        **{key: getattr(base, key) for key in ("zeta", "max_steps")},
+        **{key: getattr(flight.base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position")},
         "target_field": true_target(first),
         **measures["with_signal"],
         "without_signal": measures["without_signal"] | {"ellipse": estimated.ellipse()},
     }
     write_json(config.out / "flight.json", result)
-    draw(config, steps, measures, base)
+    draw(config, steps, measures, flight.base)
     return result
 
 
 def summary(result: dict[str, Any]) -> str:
     """Return the result of a flight as text."""
-    errors = result["errors"]
-    errors = errors if isinstance(errors, str) else "{:g} deg, {:g} deg, {:g} nT".format(*errors)
     elements = "D={:.2f} I={:.2f} BH={:.0f}".format(*result["target_field"])
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],
         "navigator": f"{result['navigator']}, given {result['needs']} beside its readings",
-        "errors": errors,
-        "north": result["north"],
+        "data sheet": "; ".join(Sheet.lines(result)) or "no errors",
         "start": ends[0],
         "destination": f"{ends[1]}, {elements}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from magrl.benchmark import TRACKS, Track
-from magrl.envs import Tasks
-from magrl.evaluation import Flight, episode_measures, summarize
+from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import named
 from magrl.evaluation.tables import about, mean_of_runs
 from magrl.files import check_writable, write_with
 from magrl.geodesy import geodesic, move_place, polar
-from magrl.sensor_std import PERFECT, Noise
+from magrl.sensor_std import Noise
 from magrl.transforms import Conditions
 
 import torch
@@ -38,8 +37,6 @@ PLACED = ("geodesic",)
 """Navigators that read no elements."""
 ABOUT = ("navigator", "trained on", "start", "map", "elements at the destination")
 """First columns of a table: what each navigator is, and what it knows."""
-OWN_OPTIONS = ("north", "confidence", "model", "start_km", "target_std")
-"""Options of flights that a navigator may have by itself."""
 OWN_MODEL = "model"
 """``target_std`` in a file, where the elements of the destination are from the vehicle's own model."""
 
@@ -55,23 +52,17 @@ class Table(NamedTuple):
 class Flights(Track):
     """A track that navigators of tables fly."""
 
-    target_std: Sequence[float] = PERFECT.noise
-    """Standard deviations of the errors of D [deg], I [deg], B_H [nT] at the destination."""
-
-    def flight(self, errors: Errors, tasks: Tasks | None = None, **changes: Any) -> Flight:
-        """Return vehicles with some errors, as a track does."""
-        return super().flight(errors, tasks, **{"target_std": self.target_std} | changes)
-
     @classmethod
     def of(cls, track: str | None = None, **options: Any) -> Flights:
-        """Return a track of the benchmark with other options, or one that these options declare."""
-        return cls(**(asdict(TRACKS[track]) if track else {}) | options)
+        """Return a track of the benchmark with other options, or one that these options declare; fields of its sheet
+        are options, too."""
+        base = TRACKS[track] if track else Track()
+        return cls(**asdict(base) | {"sheet": base.sheet.taking(options)} | options)
 
     def fly(self, navigator: Spec, errors: Errors, device: str = "cpu") -> TensorDictBase:
         """Return an episode of each task."""
-        own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
-        options = {key: None if own[key] == OWN_MODEL else own[key] for key in OWN_OPTIONS if key in own}
-        return flown(self.flight(errors, device=device, **options), {k: own[k] for k in own if k not in options})
+        own = options_of(navigator)
+        return flown(self.flight(errors, sheet=self.sheet.taking(own), device=device), own)
 
     def episodes(self, navigator: Spec, errors: Errors, device: str = "cpu") -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
@@ -82,9 +73,15 @@ class Flights(Track):
         return [summarize(episodes) for episodes in self.episodes(navigator, errors)]
 
 
+def options_of(navigator: Spec) -> dict[str, Any]:
+    """Return the name of a navigator and its options; elements of its own model are not measured."""
+    options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
+    return {key: None if value == OWN_MODEL else value for key, value in options.items()}
+
+
 def flown(flight: Flight, navigator: Spec) -> TensorDictBase:
     """Return an episode of each vehicle."""
-    options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
+    options = options_of(navigator)
     return flight.fly(flight.navigator(options.pop("name"), **options)).cpu()
 
 
@@ -201,7 +198,7 @@ def shown(value: float, share: Tensor | None, region: Tensor | None) -> str:
     return f"{value:.1f} ± {clustered(100 * share.double().flatten(), region)[1]:.1f}"
 
 
-def names(navigator: Spec, target_std: Sequence[float] = PERFECT.noise) -> list[str]:
+def names(navigator: Spec, sheet: Sheet = Sheet()) -> list[str]:
     """Return the label of a navigator, with its options, what it was trained on, and what it knows: :data:`ABOUT`.
 
     A navigator without a model of the Earth has what it needs instead. Elements of its own model tell it nothing of its
@@ -209,14 +206,16 @@ def names(navigator: Spec, target_std: Sequence[float] = PERFECT.noise) -> list[
 
     Args:
         navigator: navigator with its options.
-        target_std: accuracy of the elements at the destination, unless it has another.
+        sheet: what vehicles know, beside its options.
     """
-    options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
+    options = options_of(navigator)
     kind = named(runs_of(options.pop("name"))[0]).kind
     text, trained, needs = about(kind)
-    start_km, std = options.pop("start_km", None), options.pop("target_std", target_std)
-    known = ["no" if start_km is None else f"± {start_km:g} km", options.pop("model", needs)]
-    known.append("no" if std == OWN_MODEL else "± {:g}°, {:g}°, {:g} nT".format(*std) if any(std) else "exact")
+    columns = {key: options.pop(key) for key in ("start_km", "model", "target_std") if key in options}
+    sheet = sheet.replace(**columns)
+    known = ["no" if sheet.start_km is None else f"± {sheet.start_km:g} km", sheet.model or needs]
+    std = sheet.target_std
+    known.append("no" if std is None else "± {:g}°, {:g}°, {:g} nT".format(*std) if any(std) else "exact")
     label = ", ".join([text, *(label_of(*option) for option in options.items())])
     return [label, trained, *(["—", needs, "—"] if kind.name in PLACED else known)]
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from magrl.benchmark import COLUMNS, episode_table, write_episodes
+from magrl.evaluation import Sheet
 from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, read_document, read_text, write_text
@@ -58,7 +59,7 @@ def flights(
     made, rows, shares, tables = Flights.of(**options), [], {}, []
     share, measure = ("spl", "SPL") if "spl" in measures else ("success", "correct arrivals")
     region = made.scenario.tasks.region
-    known = [names(navigator, made.target_std) for navigator in navigators]
+    known = [names(navigator, made.sheet) for navigator in navigators]
     titles = titles_of(ABOUT, known)
     cells = mapped(
         partial(episodes_of, options, device), list(itertools.product(navigators, made.errors)), jobs, backend
@@ -87,7 +88,7 @@ def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> Ta
     """Return the table of recipes/evaluate.py, whose results are in a folder, which is replaced."""
     shutil.rmtree(folder, ignore_errors=True)
     every = tuple(run for navigator in navigators for run in runs_of(navigator))
-    evaluate(Config(navigators=every, out=folder, **options))
+    evaluate(Config(navigators=every, out=folder, sheet=Config.sheet.taking(options), **options))
     level = ", ".join(f"{std:g}" for std in read_document(folder / "settings.json")["errors"])
     episodes = read_csv(folder / "episodes.csv").rename(columns={"navigation_error_km": "final_distance_km"})
     added = {"track": "", "level": level, "region": 0, "seed": 0, "false_arrival": False}
@@ -146,7 +147,7 @@ def make(
             continue
         check_writable(out / f"{name}.md")
         write_text(out / f"{name}.md", made.text.rstrip() + "\n")
-        track = name if "target_std" in specs[name] else specs[name].get("track", name)
+        track = name if Sheet.model_fields.keys() & specs[name] else specs[name].get("track", name)
         write_episodes(out / f"{name}.csv.gz", [episodes.assign(track=track) for episodes in made.episodes])
 
 

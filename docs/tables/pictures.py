@@ -95,8 +95,8 @@ def trips(shown: int = SHOWN) -> tuple[Tensor, dict[str, tuple[Trip, float]]]:
     """Return the destination of the task that is shown, and trip and arrivals [%] of each navigator."""
     table = tomllib.loads(read_text(Path(__file__).with_name("tables.toml")))["known-1200"]
     far = Flights.of(**{key: table[key] for key in table if key not in ("kind", "measures", "navigators", "against")})
-    made, known = {}, {"model": "IGRF-13", "start_km": 5.0}
-    for name, belief, std in (("dead_reckoning", "compass and log", None), ("kalman", "and IGRF-13", far.target_std)):
+    made, known, measured = {}, {"model": "IGRF-13", "start_km": 5.0}, far.sheet.target_std
+    for name, belief, std in (("dead_reckoning", "compass and log", None), ("kalman", "and IGRF-13", measured)):
         flight = far.flight(far.errors["underwater"], **known, confidence=0.0, target_std=std)
         navigator = flight.navigator(name)
         steps = evaluation_rollout(flight.env_of(navigator, track=True), navigator)

@@ -283,7 +283,7 @@ def rule_settings(*names: str, **defaults: Any) -> Any:
 
     Args:
         names: names of :data:`RULES`.
-        **defaults: further rules, with other defaults than a scenario's.
+        **defaults: further rules, with other defaults than a scenario's; None for one that may be left out.
 
     Example:
         >>> rule_settings("zeta", max_steps=120)()
@@ -292,8 +292,10 @@ def rule_settings(*names: str, **defaults: Any) -> Any:
     fields: dict[str, Any] = {}
     for name in (*names, *defaults):
         rule: Any = Scenario.model_fields[name]
-        kind: Any = Annotated[(rule.annotation, *rule.metadata, Field(description=rule.description))]
-        fields[name] = kind, defaults.get(name, rule.default)
+        default = defaults.get(name, rule.default)
+        kind = rule.annotation if default is not None else rule.annotation | None
+        text = " ".join((rule.description or "").split())  # a command breaks lines by itself
+        fields[name] = Annotated[(kind, *rule.metadata, Field(description=text))], default
     return create_model("Settings", __base__=CheckedModel, **fields)
 
 

@@ -2,58 +2,123 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field, PlainValidator, field_serializer
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from magrl.checks import check_choice, check_device
+from magrl.checks import check_device
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import Navigator, policy_env
-from magrl.sensor_std import PERFECT, SensorStd
+from magrl.sensor_std import PERFECT, Noise, North, SensorStd
 from magrl.tracking import Rules, earth_model
-from magrl.tracking.earth import EarthModel
-from magrl.transforms import Conditions, KnownPlace, TargetErrors, TrackField, conditions_named, with_conditions
+from magrl.tracking.records import Known
+from magrl.transforms import KnownPlace, TargetErrors, TrackField, with_conditions
+from magrl.transforms.errors.conditions import CONDITIONS, Conditions, conditions_named
 from magrl.transforms.errors.north import MAGNETIC
 from magrl.transforms.track import known_keys
 
-Errors: TypeAlias = Conditions | Sequence[float] | str | Path
-NORTHS = ("true", MAGNETIC)
+_NOISE = "Errors of the readings [deg, deg, nT]"
+_ERRORS = f"""White noise on D [deg], I [deg], B_H [nT] (standard deviations), or the errors of a vehicle:
+{", ".join(CONDITIONS)}, or a file (docs/results.md). By default none, or the noise of the training."""
+
+
+def _errors(value: Any) -> Any:
+    """Return errors in plain form: three numbers, conditions, or the text that names some."""
+    if isinstance(value, str | Path):
+        conditions_named(str(value))  # an unknown name raises here
+        return str(value)
+    return value if value is None or isinstance(value, Conditions) else SensorStd.of(value).noise
+
+
+class Sheet(Known):
+    """The data sheet of simulated vehicles: errors of their sensors, and what they know of them and of their trip.
+
+    Options of commands and tables, files of results and the lines below tables follow from its fields: for a new one,
+    declare it here, or in :class:`~magrl.tracking.records.Known` if the pilot uses it, and use it.
+
+    Args:
+        errors: also :class:`~magrl.transforms.Conditions`.
+        start_km: as in :class:`~magrl.tracking.records.Known`, with ``target_std`` and ``confidence``.
+
+    Raises:
+        ValueError: for unknown conditions, or a value out of its range.
+
+    Example:
+        >>> Sheet.lines(Sheet(errors="ship", start_km=5.0).model_dump())
+        ['Error of the known start: 5 km', 'Errors of the readings: ship']
+    """
+
+    errors: Annotated[Noise | str | None, PlainValidator(_errors), Field(title=_NOISE, description=_ERRORS)] = (
+        PERFECT.noise
+    )
+    north: Annotated[North, Field(title="North")] = "true"
+    """North of the vehicles: true (they measure D), or magnetic (I and B_H alone), as for boat and drone."""
+    model: Annotated[str | None, Field(title="Model of the Earth")] = None
+    """Model of the Earth that vehicles carry, of the date: IGRF-14, IGRF-13, IGRF-2005, ...; none by default."""
+
+    @field_serializer("errors")
+    def _plain_errors(self, errors: Any) -> Any:
+        """Return the name of conditions, without a path of this machine."""
+        return Path(errors).name if isinstance(errors, str) else getattr(errors, "name", errors)
+
+    @staticmethod
+    def lines(record: Mapping[str, Any]) -> list[str]:
+        """Return what is not as by default in a record with the fields of a sheet, as text with units."""
+        lines = list[str]()
+        for name, field in Sheet.model_fields.items():
+            label, _, units = (field.title or "").rstrip("]").partition(" [")
+            if not label or (value := record.get(name, field.default)) == field.default:
+                continue
+            if isinstance(value, float | tuple):
+                numbers = value if isinstance(value, tuple) else (value,)
+                value = ", ".join(map("{:g} {}".format, numbers, units.split(", ")))
+            lines.append(f"{label}: {'not measured' if value is None else value}")
+        return lines
+
+    @property
+    def conditions(self) -> Conditions:
+        """Errors of readings and motion, with the north of the vehicles."""
+        errors: Any = conditions_named(self.errors) if isinstance(self.errors, str) else self.errors
+        if not isinstance(errors, Conditions):
+            errors = Conditions("noise", errors={"sensors": {"noise": errors}} if any(errors or ()) else {})
+        return errors.replace_errors(north=MAGNETIC) if self.north == MAGNETIC else errors
+
+    def rules(self, scenario: Scenario, conditions: Conditions) -> dict[str, Any]:
+        """Return the values of :class:`~magrl.tracking.Rules` that vehicles know in a scenario under conditions."""
+        known = {name: value for name in Known.model_fields if (value := getattr(self, name)) is not None}
+        if self.model is None:
+            known.pop("start_km", None)
+            return known
+        known["model"] = earth_model(self.model, scenario.date, scenario.altitude_km)
+        if self.start_km is not None:
+            known |= {"target_km": 0.0, "target_std": self.target_std}
+            known |= dict(zip(("drift", "wander_km"), conditions.motion_std, strict=True))
+        return known
 
 
 class Flight:
-    """Vehicles in a scenario, with the errors of their sensors and the accuracy that they know.
+    """Vehicles in a scenario, with the errors of their sensors and what they know.
 
     Args:
-        scenario: scenario.
-        errors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real vehicle:
-            :class:`~magrl.transforms.Conditions`, a name of :data:`magrl.transforms.CONDITIONS`, or a file of
-            conditions (:func:`magrl.transforms.load_conditions`). The stated weather is for the longest distance of the
-            scenario.
-        north: ``"true"``, or ``"magnetic"`` for vehicles that have no true north: they measure I and B_H, and steer by
-            their compass (:class:`magrl.transforms.MagneticNorth`), whatever ``errors`` say of a north reference.
-        model: model of the Earth that the vehicles carry, as of the date of the scenario
-            (:func:`magrl.tracking.earth_model`): ``"IGRF-14"``, ``"IGRF-13"``, ``"IGRF-2005"``; None without one, as in
-            the paper.
-        start_km: root mean square error of the place where they start [km]; None where they do not know it.
-        target_km: the same of the destination, where they know the start.
-        target_std: standard deviations of D [deg], I [deg], B_H [nT] of the elements at the destination, which have
-            such errors (:class:`magrl.transforms.TargetErrors`) and state them; None for vehicles that know the start
-            and take the elements from their own model.
-        rules: further values of :class:`magrl.tracking.Rules`, such as ``step_price``.
-        confidence: minimum probability at which navigators declare an arrival, with arrival ``"declared"``.
+        scenario: scenario. The stated weather is for its longest distance.
+        sheet: data sheet of the vehicles; perfect sensors, and no other knowledge, by default.
         num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
         seed: random seed of the errors, random start headings and metaheuristics.
         device: device of the environment.
-        options: further options of :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``.
+        options: fields of :class:`Sheet` that replace the sheet's, such as ``errors``; and further options of
+            :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``.
 
     Attributes:
+        sheet: data sheet, with the north that the errors decide.
+        rules: values of :class:`~magrl.tracking.Rules` that vehicles know beside the limits of the environment.
         base: environment without errors.
         env: environment with errors.
         sensor_std: accuracy of the sensors as the vehicles know it.
@@ -70,50 +135,33 @@ class Flight:
     def __init__(
         self,
         scenario: Scenario,
+        sheet: Sheet | None = None,
         *,
-        errors: Errors = PERFECT.noise,
-        north: str = "true",
-        model: EarthModel | str | None = None,
-        start_km: float | None = None,
-        target_km: float = 0.0,
-        target_std: Sequence[float] | None = (0.0, 0.0, 0.0),
-        rules: Mapping[str, Any] | None = None,
-        confidence: float = 0.0,
         num_envs: int | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
         **options: Any,
     ) -> None:
         check_device(device)
-        self.seed = seed
-        self.rules: dict[str, Any] = {"confidence": confidence, **(rules or {})}
+        sheet, self.seed = (sheet or Sheet()).taking(options), seed
+        conditions, trip_km = sheet.conditions, max(500.0, scenario.distance_range_km[1])
+        if "weather" in conditions.errors:
+            conditions = conditions.replace_errors(weather={"trip_km": trip_km, **conditions.errors["weather"]})
+        self.sensor_std = conditions.std
+        self.sheet = sheet.replace(
+            errors=sheet.errors or PERFECT.noise, north=MAGNETIC if conditions.std.magnetic else "true"
+        )
+        self.rules = sheet.rules(scenario, conditions)
         tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)
         options |= {"num_envs": tasks if num_envs is None else num_envs, "seed": seed, "device": device}
-        errors = conditions_named(str(errors)) if isinstance(errors, str | Path) else errors
-        check_choice(NORTHS, north=north)
-        if not isinstance(errors, Conditions):
-            noise = SensorStd.of(errors).noise
-            errors = Conditions("noise", errors={"sensors": {"noise": noise}} if any(noise) else {})
-        if north == MAGNETIC:
-            errors = errors.replace_errors(north=MAGNETIC)
-        if "weather" in errors.errors:
-            trip_km = max(500.0, scenario.distance_range_km[1])
-            errors = errors.replace_errors(weather={"trip_km": trip_km, **errors.errors["weather"]})
-        drift = {"drift_km": errors.drift_km(options.get("max_leg_km", scenario.max_leg_km))}
+        drift = {"drift_km": conditions.drift_km(options.get("max_leg_km", scenario.max_leg_km))}
         self.base = GeomagneticNavEnv(scenario, **drift | options)
-        self.env = with_conditions(self.base, errors, seed)
-        self.sensor_std = errors.std
-        if model is not None:
-            self.rules["model"] = earth_model(model, scenario.date, scenario.altitude_km)
-        if target_std is not None and any(target_std):
-            self.rules["target_std"] = target_std
-            drawn = (0.0 if errors.std.magnetic else target_std[0], *target_std[1:])  # by a compass, D is 0 everywhere
+        self.env = with_conditions(self.base, conditions, seed)
+        if sheet.target_std is not None and any(sheet.target_std):
+            drawn = (0.0 if conditions.std.magnetic else sheet.target_std[0], *sheet.target_std[1:])  # compass: D is 0
             self.env = TransformedEnv(self.env, TargetErrors(drawn, seed=seed), auto_unwrap=True)
-        if start_km is not None:
-            told = {"start_km": start_km, "target_km": target_km, "target_std": target_std}
-            told |= dict(zip(("drift", "wander_km"), errors.motion_std, strict=True))
-            self.rules |= told if model is not None else {}
-            self.env = TransformedEnv(self.env, KnownPlace(start_km, target_km, seed=seed), auto_unwrap=True)
+        if sheet.start_km is not None:
+            self.env = TransformedEnv(self.env, KnownPlace(sheet.start_km, seed=seed), auto_unwrap=True)
 
     def navigator(self, policy: TensorDictModuleBase | str, **options: Any) -> TensorDictModuleBase:
         """Return a policy that flies within the limits of the environment, with the accuracy of its sensors.
@@ -170,7 +218,8 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
             trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.
-        options: of :class:`Flight`, such as ``errors``. All tasks are flown at once: split a set that is too large.
+        options: of :class:`Flight`, such as ``errors`` and other fields of :class:`Sheet`. All tasks are flown at once:
+            split a set that is too large.
 
     Returns:
         ``(M,)``, one row for each task in its order, with the measures of

@@ -2,46 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from typing_extensions import Doc
+from typing import Any, Literal
 
 from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import Scenario, Tasks, load_scenario, named_tasks
-from magrl.envs.scenario import RULES
+from magrl.envs.scenario import RULES, rule_settings
 from magrl.envs.tasks import RANDOM_SETS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
 """Seed of random tasks with --tasks-seed 0: beyond the seeds of trainings and of frozen sets."""
 
-
-CHANGEABLE = (*RULES, "altitude_km")
-"""Fields of a scenario that a command line can change."""
-
-
-def _changes(options: Any) -> dict[str, Any]:
-    """Return the fields that are given."""
-    return {name: value for name in CHANGEABLE if (value := getattr(options, name)) is not None}
-
-
-def _optional(name: str) -> tuple[str, Any, Any]:
-    field = Scenario.model_fields[name]
-    return name, Annotated[field.annotation | None, Doc(field.description or "")], None  # type: ignore[operator]
-
-
-ScenarioOptions: Any = make_dataclass(
-    "ScenarioOptions",
-    map(_optional, CHANGEABLE),
-    namespace={"changes": _changes},
-    frozen=True,
-    kw_only=True,
-)
-"""Settings of a command: :data:`CHANGEABLE`, each None for its value in the scenario's file or in the trainings, or its
-default."""
+ScenarioOptions: Any = rule_settings(**dict.fromkeys((*RULES, "altitude_km")))
+"""Fields of a scenario that a command line can change, each None for its value in the scenario's file or in the
+trainings, or its default."""
 
 
 def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | None = None, **changes: Any) -> Scenario:

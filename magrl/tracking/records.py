@@ -65,21 +65,46 @@ class EpisodeRules(CheckedModel):
         return self.arrival == "declared"
 
 
-class Rules(EpisodeRules):
+class Known(CheckedModel):
+    """What a vehicle knows of its trip beside the rules of the episode, and decides with.
+
+    Each is declared here alone. :class:`Rules` and the sheet of a simulated vehicle
+    (:class:`magrl.evaluation.flight.Sheet`) inherit it, and commands take their options from there. A title names it
+    below tables, with its units.
+
+    Raises:
+        ValueError: for a value out of its range, or an unknown name.
+
+    Example:
+        >>> Known(confidence=2.0)
+        Traceback (most recent call last):
+        ValueError: confidence must be less than or equal to 1, got 2.0
+    """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    start_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM, title="Error of the known start [km]")] = None
+    """Error (RMS) of the start as vehicles know it, with a model [km]; by default they do not know their start."""
+    target_std: Annotated[
+        tuple[_Std, _Std, _Std] | None,
+        Field(strict=False, title="Errors of the elements at the destination [deg, deg, nT]"),
+    ] = (0.0, 0.0, 0.0)
+    """Errors of D [deg], I [deg], B_H [nT] at the destination (standard deviations); exact by default.
+    None if the elements are from the vehicles' own model, to which they add nothing."""
+    confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Minimum estimated probability of a correct arrival at which vehicles declare it."""
+
+
+class Rules(Known, EpisodeRules):
     """What a vehicle knows before it starts: the rules of the episode, and what it expects of the field.
 
     Args:
-        confidence: minimum probability of a correct declaration; below it, episodes end without one.
         range_km: prior standard deviation of the displacement to the destination along each axis [km].
         step_price: price of a step [% of SPL]: a higher one gives fewer steps and a longer path.
         caution: weight of the uncertainty in the plan.
         model: model of the Earth that the vehicle carries (:func:`~magrl.tracking.earth_model`); None for no other
             knowledge than the spectrum of the Earth's field.
-        start_km: root mean square error of the place where it starts, with a model [km]; None where it does not know
-            its place.
-        target_km: the same of the destination's place; None where it knows the elements alone.
-        target_std: standard deviations of D, I [deg], B_H [nT] with which the elements at the destination were
-            measured, at its place; None where they are from the vehicle's own model, which they add nothing to.
+        target_km: root mean square error of the place of the destination [km]; None where it knows the elements alone.
         drift: constant drift of dead reckoning along each axis [share of the distance].
         wander_km: random part of it along each axis after 1 km [km].
 
@@ -91,14 +116,11 @@ class Rules(EpisodeRules):
         False
     """
 
-    confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
     range_km: Annotated[float, Field(gt=0)] = RANGE_KM
     step_price: Annotated[float, Field(gt=0)] = STEP_PRICE
     caution: Annotated[float, Field(ge=0)] = CAUTION
     model: EarthModel | None = None
-    start_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
     target_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
-    target_std: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] | None = (0.0, 0.0, 0.0)
     drift: Annotated[float, Field(ge=0, le=1)] = 0.0
     wander_km: Annotated[float, Field(ge=0)] = 0.0
 

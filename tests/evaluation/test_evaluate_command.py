@@ -5,12 +5,17 @@ import json
 from pathlib import Path
 
 import evaluate
+import fly
 import pytest
 import torch
 
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
+from magrl.evaluation import Sheet
+from magrl.evaluation.navigators import PRETRAINED
+from magrl.navigators import NAVIGATORS
 from magrl.training import UsageError
+from magrl.transforms import CONDITIONS
 
 NOISE = (0.05, 0.05, 5.0)
 TARGET = ("--target-std", "0.01", "0.02", "3")
@@ -61,7 +66,7 @@ def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
     first, *_, published, _ = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:6]]
     assert first[:3] == ["Gradient-Guided TD3, trained with noise", "the region", "nothing"]
     assert [published[0], *published[4:8]] == ["PSO, paper", "29.0", "442495", "27.09", "21.03"]
-    assert "Standard deviations of the noise on D, I and B_H: 0.05 deg, 0.05 deg, 5 nT." in lines
+    assert "Errors of the readings: 0.05 deg, 0.05 deg, 5 nT." in lines
     assert "Errors of the elements at the destination: 0.01 deg, 0.02 deg, 3 nT." in lines
     assert (results / "trajectories.png").stat().st_size > 10_000
 
@@ -106,7 +111,8 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     )
     (run / "scenario.toml").write_text(OWN, encoding="utf-8")
     names = (f"{run}", "secant")
-    evaluate.evaluate(evaluate.Config(names, **config, **options))
+    config["rules"] = evaluate.ScenarioOptions(**options)
+    evaluate.evaluate(evaluate.Config(names, **config))
     settings = json.loads((out / "settings.json").read_text(encoding="utf-8"))
     assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 2}).items()
     arrived = [row for row in rows(out / "episodes.csv") if row["success"] == "True"]
@@ -119,7 +125,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
         ("--tasks figure-4-1 lies in the paper's region", {"tasks": "figure-4-1"}),
     ):
         with pytest.raises(UsageError, match=message):
-            evaluate.evaluate(evaluate.Config(names[:1], **(config | options | change | {"out": tmp_path / "other"})))
+            evaluate.evaluate(evaluate.Config(names[:1], **(config | change | {"out": tmp_path / "other"})))
     assert not (tmp_path / "other").exists()
 
 
@@ -128,7 +134,6 @@ def test_bad_usage_is_refused_before_anything_is_flown(tmp_path, monkeypatch) ->
     for navigators, options, message in (
         ((), {}, "at least one navigator"),
         (("dowsing",), {}, "unknown navigator 'dowsing'"),
-        (("secant",), {"errors": "yacht"}, r"or a file that ends in \.toml or \.json, got 'yacht'"),
         (("secant",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
         (("secant",), {"tasks_seed": 7}, "--tasks-seed 7 needs a number of random tasks, such as --tasks 300"),
         (("ga",), {"seed": -1}, "seed"),
@@ -139,6 +144,21 @@ def test_bad_usage_is_refused_before_anything_is_flown(tmp_path, monkeypatch) ->
         with pytest.raises(UsageError, match=message):
             evaluate.evaluate(evaluate.Config(navigators, **given))
     assert not (tmp_path / "out").exists()
+
+
+def test_options_come_from_the_records_and_registries(capsys) -> None:
+    """Names of navigators and vehicles, and an error that says which there are, before anything is flown."""
+    for command, places in ((evaluate, ["secant"]), (fly, ["60.4N 5.3E", "60.4N 3.3E"])):
+        with pytest.raises(SystemExit):
+            command.main(["--help"])
+        words = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert ", ".join((*NAVIGATORS, *PRETRAINED)) in words
+        assert ", ".join(CONDITIONS) in words
+        for name in Sheet.model_fields:
+            assert f"--{name.replace('_', '-')} " in words
+        with pytest.raises(SystemExit):
+            command.main([*places, "--errors", "yacht"])
+        assert "must be one of 'laboratory'" in capsys.readouterr().err
 
 
 def test_results_go_to_the_first_folder_that_is_free(tmp_path: Path, monkeypatch) -> None:

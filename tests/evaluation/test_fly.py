@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from magrl.field import IGRF, elements_at
 from magrl.training import UsageError
 
+SURE = recipe.Sheet(confidence=0.9)
+
 
 def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
     options = ("--navigator", "secant", "--out", str(tmp_path), "--start-heading", "270", "--max-steps", "7")
@@ -32,12 +34,13 @@ def test_the_pretrained_agent_arrives_and_declares_its_arrival(tmp_path: Path, m
     """Within as many kilometers at every distance; the map has both flights."""
     drawn: list[dict] = []
     monkeypatch.setattr(recipe, "trajectories_figure", lambda steps, *_: drawn.append(steps) or Figure())
-    config = recipe.Config("60.4N 5.3E", "60.4N 3.3E", errors=(0.05, 0.05, 5.0), title="Out to sea", out=tmp_path)
+    sheet = recipe.Sheet(errors=(0.05, 0.05, 5.0), confidence=0.5)
+    config = recipe.Config("60.4N 5.3E", "60.4N 3.3E", sheet=sheet, title="Out to sea", out=tmp_path)
     result = recipe.fly(config)
     assert result["outcome"] == "arrived"
     assert result["max_steps"] == round(3 * result["shortest_km"] / 50) + 20
     far = recipe.prepare(config.__class__("60N 5E", "70N 5E"))["with_signal"][0]
-    assert (result["zeta"], far.base_env.zeta) == (0.01, pytest.approx(0.01 * (400 / 1115) ** 2, rel=1e-3))
+    assert (result["zeta"], far.base.zeta) == (0.01, pytest.approx(0.01 * (400 / 1115) ** 2, rel=1e-3))
     ((first, _), (_, flight)), alone = zip(*drawn[0].items(), strict=True), result["without_signal"]
     assert flight["next", "declared"][0, -1]
     assert first.startswith("Out to sea: anywhere with an arrival signal")
@@ -50,9 +53,9 @@ def test_a_flight_that_runs_out_of_steps_is_not_declared(tmp_path: Path) -> None
     config = recipe.Config("60.4N 5.3E", "60.4N 0.3E", navigator="kalman", max_steps=2, out=tmp_path)
     result = recipe.fly(config)
     assert (result["outcome"], result["without_signal"]["outcome"]) == ("reached the step limit", "not declared")
-    env = recipe.prepare(recipe.Config("60.4N 5.3E", "60.4N 0.3E", navigator="kalman", confidence=0.9))[
+    _, env, _ = recipe.prepare(recipe.Config("60.4N 5.3E", "60.4N 0.3E", navigator="kalman", sheet=SURE))[
         "without_signal"
-    ][0]
+    ]
     assert env.transform[-1].rules.confidence == 0.9
     assert "km flown, " in recipe.summary(result)
 
@@ -76,12 +79,13 @@ def test_the_distance_left_is_beside_the_path() -> None:
     ends = {"start_position": [60.0, 5.0], "target_position": [60.0, 11.0], "target_field": [1.0, 70.0, 15000.0]}
     result = {
         **ends,
-        "errors": "ship",
+        "errors": "boat",
         "outcome": "arrived",
         "navigator": "kalman",
         "needs": "nothing",
-        "north": "true",
+        "north": "magnetic",
     }
     result |= {"steps": 9, "max_steps": 50, "length_km": 343.2, "shortest_km": 354.4, "navigation_error_km": 23.6}
     result |= {"path_efficiency": 0.966, "without_signal": result | {"ellipse": "here"}}
+    assert "data sheet      Errors of the readings: boat; North: magnetic\n" in recipe.summary(result)
     assert "path            343 km flown, 23.6 km left of 354\n" in recipe.summary(result)

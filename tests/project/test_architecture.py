@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from magrl.envs.scenario import RULES
-from magrl.tracking.records import EpisodeRules
+from magrl.evaluation import Sheet
+from magrl.tracking.records import EpisodeRules, Known
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "magrl"
@@ -73,7 +74,7 @@ def test_no_cycle_among_modules() -> None:
         graph = {module: needs for module, needs in graph.items() if module not in free}
 
 
-# Rules of an episode
+# Rules of an episode, and what a vehicle knows
 
 
 OTHER_MEANINGS = {"journal.Options.arrival", "benchmark.Track.max_steps", "offline_dataset.Config.max_steps"}
@@ -81,17 +82,35 @@ OTHER_MEANINGS |= {"fly.Config.max_steps", "fly.Config.zeta", "fly.Config.start_
 """What a vehicle alone can do, frozen tasks, and defaults that follow from a flight."""
 
 
-def test_a_rule_of_an_episode_is_declared_in_one_class() -> None:
-    """With its default and its range: settings of any program inherit it."""
+def declarations(names: set[str]) -> set[str]:
+    """Fields with some names and a default, of any class of the library, a recipe or a script."""
     found = set()
     for path in [*PACKAGE.rglob("*.py"), *(ROOT / "recipes").glob("*.py"), *(ROOT / "docs").rglob("*.py")]:
         for kind in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             for node in kind.body if isinstance(kind, ast.ClassDef) else ():
-                if isinstance(node, ast.AnnAssign) and node.value and ast.unparse(node.target) in RULES:
+                if isinstance(node, ast.AnnAssign) and node.value and ast.unparse(node.target) in names:
                     found.add(f"{path.stem}.{kind.name}.{ast.unparse(node.target)}")
+    return found
+
+
+def test_a_rule_of_an_episode_is_declared_in_one_class() -> None:
+    """With its default and its range: settings of any program inherit it."""
     declared = {f"records.EpisodeRules.{name}" for name in EpisodeRules.model_fields}
     declared |= {f"scenario.Scenario.{name}" for name in set(RULES) - EpisodeRules.model_fields.keys()}
-    assert found == declared | OTHER_MEANINGS
+    assert declarations(set(RULES)) == declared | OTHER_MEANINGS
+
+
+ON_BOARD = {f"journal.Options.{name}" for name in ("model", "start_km", "north")}
+ON_BOARD |= {"journal.Destination.target_std", "journal.Journal.model", "journal.Journal.start_km"}
+"""Arguments of a vehicle of one's own; its options leave out what is given to its start."""
+
+
+def test_what_is_known_is_declared_in_one_record() -> None:
+    """A command, a table or a file of results that names one again would have to be changed with it."""
+    declared = {f"records.Known.{name}" for name in Known.model_fields} | {"records.Rules.model"}
+    declared |= {f"flight.Sheet.{name}" for name in set(Sheet.model_fields) - set(Known.model_fields)}
+    found = declarations(set(Sheet.model_fields))
+    assert found == declared | ON_BOARD | {"belief.Motion.model", "conditions.Conditions.errors"}
 
 
 # Sizes

@@ -120,10 +120,10 @@ def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, mon
 def test_columns_say_what_a_navigator_knows(monkeypatch) -> None:
     """Elements of the vehicle's own model tell it nothing of its destination, and do not count as measured."""
     std = (0.1, 0.05, 30.0)
-    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights(tasks=2, max_steps=2, target_std=std)
+    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights.of(tasks=2, max_steps=2, target_std=std)
     measured, own = {"name": "secant", **told}, {"name": "secant", **told, "target_std": flights.OWN_MODEL}
     exact, mine = measured | {"target_std": [0, 0, 0]}, {"name": "kalman", "model": "IGRF-13"}
-    assert [flights.names(spec, std)[2:] for spec in (measured, own, exact, mine, "kalman", "geodesic")] == [
+    assert [flights.names(spec, made.sheet)[2:] for spec in (measured, own, exact, mine, "kalman", "geodesic")] == [
         ["± 5 km", "IGRF-13", "± 0.1°, 0.05°, 30 nT"],
         ["± 5 km", "IGRF-13", "no"],
         ["± 5 km", "IGRF-13", "exact"],
@@ -139,7 +139,7 @@ def test_columns_say_what_a_navigator_knows(monkeypatch) -> None:
         "b",
     ]
     monkeypatch.setattr(flights, "flown", lambda flight, _: flight.rules["target_std"])
-    assert [made.fly(spec, LEVELS[0]) for spec in (measured, own, exact)] == [std, None, [0, 0, 0]]
+    assert [made.fly(spec, LEVELS[0]) for spec in (measured, own, exact)] == [std, None, (0, 0, 0)]
 
 
 def test_differences_are_of_correct_arrivals_where_cells_are() -> None:

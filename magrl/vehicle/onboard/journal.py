@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
-from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
+from magrl.sensor_std import OUTAGE_STD, PERFECT, North, SensorStd
 from magrl.tracking import Rules
 from magrl.tracking.belief import CONSTANT, DRIFT, PLACE
 from magrl.tracking.displacement import Displacement
@@ -93,7 +93,7 @@ looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     model: None = None
     start_km: None = None
     target_km: None = None
-    north: Literal["true", "magnetic"] = "true"
+    north: North = "true"
     sensor_std: Annotated[SensorStd, BeforeValidator(_accuracy)] = PERFECT
     navigator: str = ""
     weights: str = ""

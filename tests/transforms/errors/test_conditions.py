@@ -17,7 +17,7 @@ from torchrl.envs.utils import step_mdp
 from magrl import Anywhere, Kalman
 from magrl.counters import stream_normal
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
-from magrl.evaluation import evaluation_rollout
+from magrl.evaluation import Sheet, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
@@ -178,7 +178,7 @@ def test_agents_heed_all_errors_that_are_stated(kind: type[Kalman]) -> None:
 
 def test_evaluate_under_conditions(tmp_path: Path) -> None:
     out = tmp_path / "results"
-    config = evaluate.Config(("secant",), tasks=5, errors="ship", out=out)
+    config = evaluate.Config(("secant",), tasks=5, sheet=Sheet(errors="ship"), out=out)
     config, (flight, _), navigators, _ = evaluate.prepare(config)
     assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
     assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
@@ -203,8 +203,8 @@ def test_own_errors_in_a_file() -> None:
     flown = [evaluation_rollout(env, Secant()) for env in envs]
     torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
-        assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).errors == str(BOAT)
-        noise = tyro.cli(recipe.Config, args=[*places, "--errors", "0.05", "0.05", "5"]).errors
+        assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).sheet.errors == str(BOAT)
+        noise = tyro.cli(recipe.Config, args=[*places, "--errors", "0.05", "0.05", "5"]).sheet.errors
         assert noise == (0.05, 0.05, 5.0)
 
 
@@ -282,9 +282,9 @@ def test_an_error_is_one_class_and_one_row(tmp_path: Path, monkeypatch: pytest.M
 
 def test_fly_under_conditions(tmp_path: Path) -> None:
     """With a heading that was chosen, which is the true one; the measured one has the error of the north reference."""
-    options = {"errors": "underwater", "start_heading": 90.0, "max_steps": 2}
+    options = {"sheet": Sheet(errors="underwater"), "start_heading": 90.0, "max_steps": 2}
     config = fly.Config("60.4N 5.3E", "64.1N 21.9W", navigator="secant", out=tmp_path, **options)
-    steps = fly.rollout(*fly.prepare(config)["with_signal"], 90.0)
+    steps = fly.rollout(*fly.prepare(config)["with_signal"][1:], 90.0)
     north = torch.rad2deg(steps["true_heading"] - steps["heading"])[0, 0]
     torch.testing.assert_close(steps["true_heading"][0, 0], torch.tensor([torch.pi / 2]))
     torch.testing.assert_close(north, steps["north_error"][0, 0, 2:], atol=1e-4, rtol=0)
