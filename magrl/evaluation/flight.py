@@ -148,9 +148,8 @@ class Flight:
         if "weather" in conditions.errors:
             conditions = conditions.replace_errors(weather={"trip_km": trip_km, **conditions.errors["weather"]})
         self.sensor_std = conditions.std
-        self.sheet = sheet.replace(
-            errors=sheet.errors or PERFECT.noise, north=MAGNETIC if conditions.std.magnetic else "true"
-        )
+        north = MAGNETIC if conditions.std.magnetic else "true"
+        self.sheet = sheet.replace(errors=sheet.errors or PERFECT.noise, north=north)
         self.rules = sheet.rules(scenario, conditions)
         tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)
         options |= {"num_envs": tasks if num_envs is None else num_envs, "seed": seed, "device": device}

@@ -68,9 +68,8 @@ class EpisodeRules(CheckedModel):
 class Known(CheckedModel):
     """What a vehicle knows of its trip beside the rules of the episode, and decides with.
 
-    Each is declared here alone. :class:`Rules` and the sheet of a simulated vehicle
-    (:class:`magrl.evaluation.flight.Sheet`) inherit it, and commands take their options from there. A title names it
-    below tables, with its units.
+    Each is declared here alone. :class:`Rules` and the sheet of a simulated vehicle (:class:`magrl.evaluation.Sheet`)
+    inherit it, and commands take their options from there. A title names it below tables, with its units.
 
     Raises:
         ValueError: for a value out of its range, or an unknown name.
