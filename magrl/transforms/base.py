@@ -75,10 +75,8 @@ class ObservationTransform(Transform):
         raise NotImplementedError
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is not None:
-            for key, value in zip(self.out_keys, self._compute(values), strict=True):
-                next_tensordict.set(key, value)
+        for key, value in zip(self.out_keys, self._compute(self._read(next_tensordict)), strict=True):
+            next_tensordict.set(key, value)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
@@ -88,10 +86,8 @@ class ObservationTransform(Transform):
         """Read ``in_keys`` and write ``out_keys`` of a TensorDict, with or without an environment."""
         return self._call(tensordict)
 
-    def _read(
-        self, tensordict: TensorDictBase, keys: Keys | None = None, *, state: bool = False
-    ) -> list[Tensor] | None:
-        """Return the values at ``keys``, by default ``in_keys``; None if one is missing and this is tolerated."""
+    def _read(self, tensordict: TensorDictBase, keys: Keys | None = None, *, state: bool = False) -> list[Tensor]:
+        """Return the values at ``keys``, by default ``in_keys``."""
         checked, keys = keys is None, self.in_keys if keys is None else keys
         values = [tensordict.get(key, None) for key in keys]
         missing = [key for key, value in zip(keys, values, strict=True) if value is None]
@@ -100,8 +96,6 @@ class ObservationTransform(Transform):
                 for name, key, value in zip(self.in_names, keys, values, strict=True):
                     self._check_shape(name, key, value.shape)
             return values
-        if self.missing_tolerance:
-            return None
         name, available = type(self).__name__, sorted_keys(tensordict)
         if not state:
             raise KeyError(f"{name} reads {missing}, which are not among {available}")
@@ -206,19 +200,16 @@ class StatefulTransform(ObservationTransform):
         raise NotImplementedError
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict_reset)
-        if values is not None:
-            self._begin(tensordict_reset, values, tensordict.get("_reset", None))
+        self._begin(tensordict_reset, self._read(tensordict_reset), tensordict.get("_reset", None))
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values, state = self._read(next_tensordict, self.step_keys), self._state(tensordict)
-        if values is not None and state is not None:
-            self._advance(next_tensordict, values, state)
+        values = self._read(next_tensordict, self.step_keys)
+        self._advance(next_tensordict, values, self._state(tensordict))
         return next_tensordict
 
-    def _state(self, tensordict: TensorDictBase) -> list[Tensor] | None:
-        """Return the values at ``state_keys``; None if one is missing and this is tolerated."""
+    def _state(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return the values at ``state_keys``."""
         return self._read(tensordict, self.state_keys, state=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

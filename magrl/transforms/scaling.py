@@ -159,14 +159,12 @@ class MinMaxNorm(ObservationTransform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key, scaled in zip(self.in_keys, self.out_keys, strict=True):
-            for value in self._read(next_tensordict, [key]) or ():
-                next_tensordict.set(scaled, self.normalize(key, value))
+            next_tensordict.set(scaled, self.normalize(key, *self._read(next_tensordict, [key])))
         return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         for key, scaled in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
-            for value in self._read(tensordict, [scaled]) or ():
-                tensordict.set(key, self.denormalize(key, value))
+            tensordict.set(key, self.denormalize(key, *self._read(tensordict, [scaled])))
         return tensordict
 
     # Specs

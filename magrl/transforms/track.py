@@ -218,10 +218,7 @@ class DeclareArrival(ObservationTransform):
         return next_tensordict.set(self.out_keys[0], probability.to(next_tensordict[self.in_keys[0]].dtype))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict, [*self.in_keys, *self.in_keys_inv])
-        if values is None:
-            return tensordict
-        *seen, action = values
+        *seen, action = self._read(tensordict, [*self.in_keys, *self.in_keys_inv])
         seen = TensorDict(dict(zip(self.in_names, seen, strict=True)), batch_size=action.shape[:-1])
         track = track_of(tensordict["track"])
         return tensordict.set(self.in_keys_inv[0], declaring(self.rules, track, reading_of(seen), action)[0])

@@ -169,8 +169,8 @@ class EpisodeErrors(EpisodeNumbers):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Give the true values to the environment."""
-        state = self._state(tensordict) if self.hidden else None
-        for key, value in zip(self.in_keys_inv, state[2:], strict=True) if state is not None else ():
+        true = self._state(tensordict)[2:] if self.hidden else ()
+        for key, value in zip(self.in_keys_inv, true, strict=True):
             tensordict.set(key, value)
         return tensordict
 

@@ -128,10 +128,7 @@ class MotionError(EpisodeErrors):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the errors add to the commanded leg, which the environment adds."""
         values = self._read(tensordict, [*self.in_keys_inv, self.in_keys[2]])
-        state = self._state(tensordict)
-        if values is not None and state is not None:
-            tensordict.set(LEG_ERROR, self._leg_error(*values, *state))
-        return tensordict
+        return tensordict.set(LEG_ERROR, self._leg_error(*values, *self._state(tensordict)))
 
     def _leg_error(self, action: Tensor, heading: Tensor, position: Tensor, errors: Tensor, stream: Tensor) -> Tensor:
         """Return the leg on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
