@@ -21,9 +21,6 @@ from torch import Tensor
 
 from magrl.checks import UsageError, check_type, short
 
-MAX_FILE_BYTES = 10_000_000
-"""Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
-
 
 class DamagedFileError(ValueError):
     """A file that is truncated, altered, or not of the expected kind.
@@ -330,7 +327,7 @@ def read_document(path: Path) -> Any:
     """Return the content of a TOML or JSON file that a user wrote.
 
     Raises:
-        ValueError: for another suffix, a file that is too large or not valid, or a key that is repeated.
+        ValueError: for another suffix, a file that is not valid, or a key that is repeated.
         OSError: for a file that cannot be read.
 
     Example:
@@ -343,10 +340,7 @@ def read_document(path: Path) -> Any:
     parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
     if path.suffix.lower() not in parsers:
         raise ValueError(f"the file must end in .toml or .json, got {path.suffix!r}")
-    with path.open("rb") as file:
-        content = file.read(MAX_FILE_BYTES + 1)
-    if len(content) > MAX_FILE_BYTES:
-        raise ValueError(f"the file holds more than {MAX_FILE_BYTES} bytes")
+    content = path.read_bytes()
     try:
         return parsers[path.suffix.lower()](content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
