@@ -9,7 +9,7 @@ import math
 import os
 import tomllib
 import uuid
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 from torch import Tensor
 
-from magrl.checks import UsageError, check_type, short
+from magrl.checks import UsageError, check_type
 
 
 class DamagedFileError(ValueError):
@@ -327,7 +327,7 @@ def read_document(path: Path) -> Any:
     """Return the content of a TOML or JSON file that a user wrote.
 
     Raises:
-        ValueError: for another suffix, a file that is not valid, or a key that is repeated.
+        ValueError: for another suffix, or a file that is not valid.
         OSError: for a file that cannot be read.
 
     Example:
@@ -337,7 +337,7 @@ def read_document(path: Path) -> Any:
         >>> read_document(path)
         {'speed_km_h': 15.0}
     """
-    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
+    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": json.loads}
     if path.suffix.lower() not in parsers:
         raise ValueError(f"the file must end in .toml or .json, got {path.suffix!r}")
     content = path.read_bytes()
@@ -345,15 +345,6 @@ def read_document(path: Path) -> Any:
         return parsers[path.suffix.lower()](content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
-
-
-def _json(text: str) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(content := dict(pairs)) < len(pairs):
-            raise ValueError(f"the key {short(Counter(key for key, _ in pairs).most_common(1)[0][0])} is repeated")
-        return content
-
-    return json.loads(text, object_pairs_hook=unique)
 
 
 def locked(folder: Path) -> AcquireReturnProxy:
