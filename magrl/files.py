@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
@@ -129,7 +128,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def append(path: Path, record: bytes) -> None:
-    """Add a record to the end of a file, whole or not at all, also where the disk is full.
+    """Add a record to the end of a file.
 
     Raises:
         OSError: naming the file and the reason.
@@ -142,14 +141,8 @@ def append(path: Path, record: bytes) -> None:
         b'1,2'
     """
     try:
-        with path.open("ab", buffering=0) as file:
-            end = file.tell()
-            try:
-                if file.write(record) < len(record):  # the part that still had room
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            except OSError:
-                file.truncate(end)
-                raise
+        with path.open("ab") as file:
+            file.write(record)
     except OSError as error:
         raise _not_written(path, error) from error
 

@@ -21,7 +21,6 @@ from torch import nn
 
 from magrl.files import (
     DamagedFileError,
-    append,
     check_writable,
     json_ready,
     load_tensors,
@@ -188,7 +187,6 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "JSON": lambda path: write_json(path, {"a": LONG}),
     "tensors": lambda path: save_tensors(torch.ones(LEAST_BYTES), path),
     "another library": lambda path: write_with(path, Path.write_text, LONG, encoding="utf-8"),
-    "record": lambda path: append(path, LONG.encode()),
 }
 
 
