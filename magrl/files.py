@@ -104,7 +104,6 @@ def write_with(path: Path, write: Callable[..., Any], *args: Any, **options: Any
         with aside.open("rb") as file:
             os.fsync(file.fileno())
         os.replace(aside, path)
-        _sync_folder(path.parent)
     except OSError as error:
         raise _not_written(path, error) from error
     finally:
@@ -231,16 +230,6 @@ def _unpack(item: Any, tensors: dict[str, Tensor]) -> Any:
         case dict():
             return {key: _unpack(value, tensors) for key, value in item.items()}
     return item
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename survive a power failure, where folders can be synchronized."""
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 def json_ready(value: Any) -> Any:
