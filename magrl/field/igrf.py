@@ -37,24 +37,12 @@ def parse_date(date: Date) -> datetime.datetime:
         >>> parse_date(2022.5)
         datetime.datetime(2022, 7, 2, 12, 0)
     """
-    if isinstance(date, str):
-        try:
-            date = datetime.datetime.fromisoformat(date)
-        except ValueError as error:
-            raise ValueError(f"date {date!r} is not an ISO date such as '2022-01-01'") from error
-    if isinstance(date, (np.datetime64, datetime.date)) and date != date:
-        raise ValueError(f"date {date!r} is missing")
-    if isinstance(date, np.datetime64):
-        moment = date.astype("M8[us]").item()
-        if not isinstance(moment, datetime.datetime):
-            raise ValueError(f"date {date!r} is not in a year between 1 and 9999")
-        return moment
-    if isinstance(date, datetime.datetime):
-        return date.astimezone(datetime.UTC).replace(tzinfo=None) if date.tzinfo else date
-    if isinstance(date, datetime.date):
-        return datetime.datetime(date.year, date.month, date.day)
     if isinstance(date, bool) or not isinstance(date, Real):
-        raise ValueError(f"date {date!r} is neither a datetime, nor ISO text, nor a decimal year")
+        try:
+            moment = datetime.datetime.fromisoformat(str(date))  # all dates of Python and NumPy are ISO as text
+        except ValueError as error:
+            raise ValueError(f"date {date!r} is not an ISO date such as '2022-01-01', nor a decimal year") from error
+        return moment.astimezone(datetime.UTC).replace(tzinfo=None) if moment.tzinfo else moment
     if not 1 <= date < 9999:
         raise ValueError(f"date {short(date)} is not a year between 1 and 9999")
     year = int(date)
