@@ -15,8 +15,6 @@ from torch import Tensor
 from magrl.checks import check_number
 from magrl.field.igrf import igrf_coefficients
 
-KNOWN_DEGREE = 13
-"""Highest degree of IGRF."""
 STRENGTH, TILT_DEG, SPREAD = (0.7, 1.3), 40.0, (0.5, 2.0)
 """Ranges of the strength of the dipole [Earth's], its largest tilt [deg] and the factor of a variance."""
 
@@ -44,13 +42,8 @@ def power_spectrum(gauss: Tensor) -> Tensor:
     return n * torch.view_as_real(gauss).square().sum((-2, -1))
 
 
-def random_planets(
-    count: int,
-    seed: int,
-    *,
-    degree: int = 13,
-) -> Tensor:
-    """Return Gauss coefficients of planets whose fields have the Earth's spectrum.
+def random_planets(count: int, seed: int) -> Tensor:
+    """Return Gauss coefficients of planets whose fields have the Earth's spectrum, to degree 13.
 
     The dipole has the strength of the Earth's, times a random factor, is tilted from the axis of rotation to a random
     side, and has the polarity of the Earth's. Every other coefficient is normal; its variance is the Earth's power of
@@ -61,15 +54,13 @@ def random_planets(
     Args:
         count: number of planets.
         seed: random seed; the result is a pure function of the arguments.
-        degree: highest degree N. Above 13, the spectrum continues the line through the logarithms of the power of
-            degrees 2 to 13; this is the field of the core, without the crust.
 
     Returns:
-        Complex ``(count, N + 1, N + 1)`` tables ``g - i h`` [nT], for :class:`~magrl.field.SphericalHarmonicField` and
+        Complex ``(count, 14, 14)`` tables ``g - i h`` [nT], for :class:`~magrl.field.SphericalHarmonicField` and
         :class:`~magrl.field.FieldBank`.
 
     Raises:
-        ValueError: for a count, degree or seed that is not a whole number in its range.
+        ValueError: for a count or seed that is not a whole number in its range.
 
     Example:
         >>> planets = random_planets(1000, seed=0)
@@ -78,16 +69,16 @@ def random_planets(
         >>> bool((planets[:, 1, 0].real < 0).all())  # as on the Earth, compasses point north
         True
     """
-    check_number(1, whole=True, count=count, degree=degree)
+    check_number(1, whole=True, count=count)
     check_number(0, 2**63 - 1, whole=True, seed=seed)
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
 
-    variance = _earth_variance(degree)
-    factor = uniform(*SPREAD, count, degree + 1, 1, 1)
-    normal = torch.randn(count, degree + 1, degree + 1, 2, generator=generator, dtype=torch.float64)
+    variance = _earth_variance()
+    factor = uniform(*SPREAD, count, len(variance), 1, 1)
+    normal = torch.randn(count, len(variance), len(variance), 2, generator=generator, dtype=torch.float64)
     gauss = torch.view_as_complex(normal * torch.sqrt(variance.reshape(-1, 1, 1) * factor)).tril()
     gauss[..., 0] = gauss[..., 0].real.to(gauss.dtype)
     dipole = math.sqrt(float(power_spectrum(_earth())[1]) / 2) * uniform(*STRENGTH, count)
@@ -100,7 +91,7 @@ def random_planets(
 class GaussMoments(NamedTuple):
     """Moments of the Gauss coefficients of :func:`random_planets` [nT, nT^2].
 
-    ``axial`` and ``axial_variance`` are those of the axial dipole. ``variance (N + 1,)`` are those of each other
+    ``axial`` and ``axial_variance`` are those of the axial dipole. ``variance (14,)`` are those of each other
     coefficient by degree, whose means are 0; that of degree 1 is for the two equatorial coefficients.
 
     Example:
@@ -113,38 +104,30 @@ class GaussMoments(NamedTuple):
     variance: Tensor
 
 
-def gauss_moments(degree: int = KNOWN_DEGREE) -> GaussMoments:
+def gauss_moments() -> GaussMoments:
     """Return the moments of the Gauss coefficients of :func:`random_planets`.
-
-    Args:
-        degree: highest degree N.
 
     Example:
         >>> moments = gauss_moments()
         >>> round(moments.axial), round(moments.axial_variance**0.5), round(float(moments.variance[1].sqrt()))
         (-27425, 5202, 8205)
     """
-    check_number(1, whole=True, degree=degree)
     tilt = math.radians(TILT_DEG)
     dipole = math.sqrt(float(power_spectrum(_earth())[1]) / 2)
     low, high = STRENGTH
     mean, square = (sum(low**i * high ** (k - i) for i in range(k + 1)) / (k + 1) * dipole**k for k in (1, 2))
     cos2 = (1 + math.sin(2 * tilt) / (2 * tilt)) / 2
     axial = -mean * math.sin(tilt) / tilt
-    variance = _earth_variance(degree) * sum(SPREAD) / 2
+    variance = _earth_variance() * sum(SPREAD) / 2
     variance[1] = square * (1 - cos2) / 2
     return GaussMoments(axial, square * cos2 - axial**2, variance)
 
 
-def _earth_variance(degree: int) -> Tensor:
-    """Return the mean square coefficient of each degree, ``(degree + 1,)`` [nT²]; zero below degree 2."""
-    n = torch.arange(max(degree, KNOWN_DEGREE) + 1, dtype=torch.float64)
-    log_power = torch.log(power_spectrum(_earth())[2:])
-    line = torch.stack((torch.ones_like(n), n), -1)
-    fit = line @ torch.linalg.lstsq(line[2 : KNOWN_DEGREE + 1], log_power.unsqueeze(-1)).solution
-    power = torch.exp(torch.cat((log_power, fit[KNOWN_DEGREE + 1 :, 0])))
-    variance = torch.nn.functional.pad(power, (2, 0)) / ((n + 1) * (2 * n + 1))
-    return variance[: degree + 1]
+def _earth_variance() -> Tensor:
+    """Return the mean square coefficient of each degree, ``(14,)`` [nT²]; zero below degree 2."""
+    power = torch.exp(torch.log(power_spectrum(_earth())[2:]))  # published numbers rest on this rounding
+    n = torch.arange(len(power) + 2, dtype=torch.float64)
+    return torch.nn.functional.pad(power, (2, 0)) / ((n + 1) * (2 * n + 1))
 
 
 def _earth() -> Tensor:

@@ -113,7 +113,7 @@ def test_the_edges_belong_to_the_box_and_beyond_is_nan(bank: FieldBank) -> None:
 
 def test_many_boxes_are_built_as_one_by_one() -> None:
     """More boxes and planets than are expanded at a time."""
-    planets, planet = random_planets(70, seed=2, degree=4), torch.arange(150) % 70
+    planets, planet = random_planets(70, seed=2)[:, :5, :5], torch.arange(150) % 70
     edges = boxes(torch.linspace(-70, 60, 150).double(), torch.linspace(-180, 400, 150).double(), 8.0, 8.0)
     options = {"degree": 6, "tolerance_nt": 1.0}
     whole = FieldBank.build(planets, planet, *edges, **options)

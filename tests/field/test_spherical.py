@@ -286,14 +286,3 @@ def test_a_seed_gives_the_same_planets_and_another_gives_others() -> None:
     below[0] = False
     assert (first != other)[:, below].all()
     assert (first[:-1] != first[1:])[:, below].all()
-
-
-def test_the_spectrum_continues_above_degree_13() -> None:
-    power = power_spectrum(random_planets(COUNT, seed=4, degree=20)).mean(0) / 1.25
-    n = torch.arange(2.0, 14, dtype=torch.float64)
-    known = torch.log(power_spectrum(EARTH)[2:])
-    slope = float(((n - n.mean()) * known).sum() / (n - n.mean()).square().sum())
-    expected = [math.exp(float(known.mean()) + slope * (k - 7.5)) for k in range(14, 21)]
-    assert power[14:].tolist() == pytest.approx(expected, rel=0.05)
-    assert power[2:14].tolist() == pytest.approx(power_spectrum(EARTH)[2:].tolist(), rel=0.06)
-    assert -1.5 < slope < -0.9  # the Earth's core: about a factor of 3 a degree
