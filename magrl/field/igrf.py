@@ -7,7 +7,6 @@ from functools import cache
 from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -126,8 +125,6 @@ class IGRF(SphericalHarmonicField):
         tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
     """
 
-    altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 1000.0)
-    """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
     shown = ("date", "generation", "altitude_km")
 
     def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0) -> None:

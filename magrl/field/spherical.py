@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import ClassVar, NamedTuple
 
@@ -24,7 +23,8 @@ class SphericalHarmonicField(Float64Module):
 
     Raises:
         TypeError: if ``gauss`` is not a complex tensor.
-        ValueError: for a table of another shape or with non-finite values, an altitude below -100 km.
+        ValueError: for a table of another shape or with non-finite values, or an altitude beyond its range, which is
+            probably not in kilometers.
 
     Example:
         >>> dipole = torch.zeros(2, 2, dtype=torch.complex128)
@@ -36,8 +36,8 @@ class SphericalHarmonicField(Float64Module):
     """
 
     shown: ClassVar[tuple[str, ...]] = ("degree", "altitude_km")
-    altitude_range_km: ClassVar[tuple[float, float]] = (-100.0, math.inf)
-    """Range of altitudes [km]: below it there are sources, and the expansion does not hold."""
+    altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 1000.0)
+    """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
     CHUNK = 16384
     """Points evaluated at a time; temporary memory is about 1 kB per point on a CPU and 6 kB on an accelerator."""
     value_weights: Tensor
@@ -120,9 +120,7 @@ class SphericalHarmonicField(Float64Module):
     def _check_altitude(self, altitude_km: Tensor) -> None:
         lowest, highest = self.altitude_range_km
         allowed = f"from {lowest:g} to {highest:g} km (a depth is negative): is it in meters? Divide by 1000"
-        if highest == math.inf:
-            allowed = f"a finite number from {lowest:g} km on"
-        sound = (altitude_km >= lowest) & (altitude_km <= highest) & (altitude_km < math.inf)
+        sound = (altitude_km >= lowest) & (altitude_km <= highest)
         require(sound, altitude_km, f"altitude_km {{}} is not {allowed}")
 
     def _value(self, level: bool, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
