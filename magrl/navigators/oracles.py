@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -13,11 +12,11 @@ from torch import Tensor
 from magrl import geodesy
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.bank import FieldBank
-from magrl.field.elements import NAMES, element_difference
+from magrl.field.elements import element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
-from magrl.guidance import displacement_to, parallel_approach
-from magrl.navigators.base import Navigator, element_indices
+from magrl.guidance import displacement_to
+from magrl.navigators.base import Navigator
 from magrl.navigators.quasi_newton import CURVATURE
 from magrl.sensor_std import SensorStd
 
@@ -53,18 +52,17 @@ class Geodesic(Navigator):
 class ParallelApproach(Navigator):
     """Newton steps with the true gradient at the vehicle's position: an oracle.
 
-    By default, each step closes the errors of all three elements by least squares, weighted by the inverse of
-    :data:`magrl.navigators.quasi_newton.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which
-    fails where the gradients of the pair are nearly parallel.
+    Each step closes the errors of all three elements by least squares, weighted by the inverse of
+    :data:`magrl.navigators.quasi_newton.CURVATURE`. The paper's parallel approach (Eq. 3-15) closes those of two, and
+    fails where their gradients are nearly parallel.
 
     Args:
         field: field model or bank of them, usually ``env.field``.
         max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
-        pair: two elements whose errors shrink in proportion, ``("D", "I")`` in the paper; all three for None.
 
     Raises:
-        ValueError: for a bound out of its range, or ``pair`` that is not different elements.
+        ValueError: for a bound out of its range.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -78,17 +76,11 @@ class ParallelApproach(Navigator):
     oracle, needs = True, "the gradient"
 
     def __init__(
-        self,
-        field: FieldModel | FieldBank,
-        max_leg_km: float = 50.0,
-        max_turn_rad: float = math.pi / 2,
-        pair: Sequence[str] | None = None,
+        self, field: FieldModel | FieldBank, max_leg_km: float = 50.0, max_turn_rad: float = math.pi / 2
     ) -> None:
         super().__init__(max_leg_km, max_turn_rad)
-        if not hasattr(field, "value_and_gradient"):
-            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         self.in_keys = ["field", "target_field", "heading", "position", "elapsed_steps", "region"]
-        self.field, self.elements = field, element_indices(NAMES if pair is None else pair, 2)
+        self.field = field
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
@@ -96,13 +88,9 @@ class ParallelApproach(Navigator):
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         here, there = (seen[key].double() for key in ("field", "target_field"))
-        error = element_difference(there, here)[:, self.elements]
-        gradient = elements_gradient_at(self.field, seen["position"], seen["region"].squeeze(-1))[:, self.elements]
-        scale = gradient.new_tensor(CURVATURE)[self.elements]
-        displacement = displacement_to(error / scale, gradient / scale.unsqueeze(-1))
+        gradient = elements_gradient_at(self.field, seen["position"], seen["region"].squeeze(-1))
+        scale = gradient.new_tensor(CURVATURE)
+        displacement = displacement_to(element_difference(there, here) / scale, gradient / scale.unsqueeze(-1))
         wanted = torch.atan2(displacement[:, 1], displacement[:, 0])
-        if len(self.elements) == 2:  # where the two gradients are nearly parallel, least squares still give a heading
-            heading, valid = (x.squeeze(-1) for x in parallel_approach(torch.zeros_like(error), error, gradient))
-            wanted = torch.where(valid, heading, wanted)
         now = seen["heading"].squeeze(-1).double()
         return steer(now, wanted, displacement.norm(dim=-1), self.max_leg_km, self.max_turn_rad)
