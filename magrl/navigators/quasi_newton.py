@@ -459,7 +459,7 @@ class MeanJacobian(QuasiNewton):
         **options: ``sensor_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
 
     Raises:
-        ValueError: for a bound out of its range, fewer than two places, or a negative standard deviation.
+        ValueError: for a bound out of its range, or a negative standard deviation.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -481,10 +481,6 @@ class MeanJacobian(QuasiNewton):
         **options: Any,
     ) -> None:
         super().__init__(max_leg_km, max_turn_rad, **options)
-        if not hasattr(field, "value_and_gradient"):
-            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
-        if position.numel() < 4:
-            raise ValueError(f"position must hold at least two places (..., 2), got shape {tuple(position.shape)}")
         gradients = elements_gradient_at(field, position.reshape(-1, 2).double())
         self.register_buffer("mean", gradients.mean(0))
         self.register_buffer("std", gradients.std(0))
