@@ -21,7 +21,6 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transf
 
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
-from magrl.field.elements import element_index
 from magrl.sensor_std import PERFECT, STD_KEYS, SensorStd
 from magrl.tracking import Rules
 from magrl.transforms import DeclareArrival, TrackField
@@ -30,21 +29,6 @@ from magrl.transforms.track import known_keys
 MEMORY = "memory"
 """Key of what a policy remembers of its episode."""
 _REMEDY = "policy_env(env, policy) returns the environment that has it"
-
-
-def element_indices(elements: Sequence[str], least: int) -> list[int]:
-    """Return the columns of ``field`` that hold some elements.
-
-    Raises:
-        ValueError: for an unknown name, a repeated name, or fewer than ``least`` names.
-
-    Example:
-        >>> element_indices(("D", "B_H"), least=2)
-        [0, 2]
-    """
-    if isinstance(elements, str) or len(set(elements)) != len(elements) or len(elements) < least:
-        raise ValueError(f"elements must be at least {least} different names of D, I, B_H, got {elements!r}")
-    return [element_index(name) for name in elements]
 
 
 class Navigator(TensorDictModuleBase):

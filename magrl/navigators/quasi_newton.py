@@ -20,10 +20,10 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.field.elements import NAMES
+from magrl.field.elements import NAMES, element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
-from magrl.navigators.base import Navigator, element_indices
+from magrl.navigators.base import Navigator
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.displacement import Displacement
 from magrl.tracking.local import inverse2
@@ -234,7 +234,9 @@ class QuasiNewton(Navigator):
         check_number(0, above=True, optional=True, radius_km=radius_km)
         self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
         self.in_keys = ["field", "target_field", "heading", "leg", "elapsed_steps"]
-        self.elements = element_indices(elements, 2)
+        if len(set(elements)) != len(elements) or len(elements) < 2:
+            raise ValueError(f"elements must be at least 2 different names of D, I, B_H, got {elements!r}")
+        self.elements = [element_index(name) for name in elements]
         self._register("sensor_std", SensorStd.of(sensor_std))
         self._register("periods", [PERIODS[i] for i in self.elements])
         self._register("curvature", [CURVATURE[i] for i in self.elements])
@@ -242,7 +244,9 @@ class QuasiNewton(Navigator):
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
         elements = {"elements": NAMES[1:]} if sensor_std.magnetic else {}
-        return {"sensor_std": sensor_std, "zeta": env.zeta, **search_options(env), **elements}
+        radius_km = env.scenario.radius_km if env.arrival == "distance" else None
+        search = {"search": not env.scenario.declared, "radius_km": radius_km}  # episodes end at arrival
+        return {"sensor_std": sensor_std, "zeta": env.zeta, **search, **elements}
 
     def _register(self, name: str, values: Sequence[Any]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
@@ -268,10 +272,12 @@ class QuasiNewton(Navigator):
         return torch.hypot(std.noise, SLOW_SHARE**0.5 * std.drift)[..., self.elements]
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        reading, target = (seen[key].double()[:, self.elements] for key in ("field", "target_field"))
+        field, there = (seen[key].double() for key in ("field", "target_field"))
+        reading, target = field[:, self.elements], there[:, self.elements]
         track = first_track(reading, self.prior(reading, target), self.reading_std(seen))
         decisions = torch.zeros_like(seen["elapsed_steps"].squeeze(-1))
-        return {**track._asdict(), "decisions": decisions, **first_places(seen, self.zeta)}
+        places = {"visited": unvisited_yet(field), "weights": arrival_weights(field, there, self.zeta)}
+        return {**track._asdict(), "decisions": decisions, **places}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         return self.next_leg(self.read(seen, memory), seen, memory)
@@ -299,7 +305,8 @@ class QuasiNewton(Navigator):
         self, track: FieldTrack, displacement: Displacement, seen: TensorDictBase, memory: TensorDictBase
     ) -> Tensor:
         """Return the displacement ``(N, 2)`` [km] to the most probable destination; store the end of the last leg."""
-        visit_place(seen, memory)
+        visited = visit(memory["visited"].double(), last_leg(seen))
+        memory["visited"] = torch.where((seen["elapsed_steps"] == 0).unsqueeze(-1), memory["visited"].double(), visited)
         if not self.search:
             return displacement.mean
         gradient, covariance = track.mean[..., 1:], track.covariance[..., 1:, 1:]
@@ -323,52 +330,6 @@ def last_leg(seen: TensorDictBase) -> Tensor:
     """
     heading = seen["heading"].double()
     return seen["leg"][..., :1].double() * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
-
-
-def search_options(env: GeomagneticNavEnv) -> dict[str, Any]:
-    """Return whether episodes end at arrival, so that places without an arrival are excluded, and within what distance.
-
-    Example:
-        >>> search_options(GeomagneticNavEnv(arrival="distance", seed=0))
-        {'search': True, 'radius_km': 25.0}
-    """
-    return {
-        "search": not env.scenario.declared,
-        "radius_km": env.scenario.radius_km if env.arrival == "distance" else None,
-    }
-
-
-def first_places(seen: TensorDictBase, zeta: float) -> dict[str, Tensor]:
-    """Return what a search remembers at the start: no visited places, and the weights of the arrival.
-
-    Args:
-        seen: first state, with ``field`` and ``target_field`` ``(N, 3)``.
-        zeta: arrival threshold on the objective.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> seen = TensorDict({"field": [[0.0, 60.0, 20000.0]], "target_field": [[2.0, 60.0, 20100.0]]}, 1)
-        >>> {name: tuple(value.shape) for name, value in first_places(seen, 0.01).items()}
-        {'visited': (1, 24, 2), 'weights': (1, 3)}
-    """
-    field, target = (seen[key].double() for key in ("field", "target_field"))
-    return {"visited": unvisited_yet(field), "weights": arrival_weights(field, target, zeta)}
-
-
-def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
-    """Remember that the vehicle has been at the end of its last leg.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> seen = TensorDict({"leg": [[30.0, 0.0]], "heading": [[0.0]], "elapsed_steps": [[1]]}, 1)
-        >>> memory = TensorDict({"visited": torch.full((1, 24, 2), 100.0)}, 1)
-        >>> visit_place(seen, memory)
-        >>> memory["visited"][0, :2]
-        tensor([[  0.,   0.],
-                [ 70., 100.]], dtype=torch.float64)
-    """
-    visited = visit(memory["visited"].double(), last_leg(seen))
-    memory["visited"] = torch.where((seen["elapsed_steps"] == 0).unsqueeze(-1), memory["visited"].double(), visited)
 
 
 def probe_length(noise: Sequence[float]) -> float:
