@@ -299,7 +299,8 @@ class QuasiNewton(Navigator):
         target, bias_std = target[..., self.elements], bias_std[..., self.elements]
         displacement = estimated_displacement(track, target, RANGE_KM, bias_std, self.curvature, self.periods)
         aim = self.aim(track, displacement, seen, memory)
-        return self.steer(seen, aim, aim.norm(dim=-1))
+        heading, bearing = seen["heading"].squeeze(-1).double(), torch.atan2(aim[:, 1], aim[:, 0])
+        return steer(heading, bearing, aim.norm(dim=-1), self.max_leg_km, self.max_turn_rad)
 
     def aim(
         self, track: FieldTrack, displacement: Displacement, seen: TensorDictBase, memory: TensorDictBase
@@ -312,12 +313,6 @@ class QuasiNewton(Navigator):
         gradient, covariance = track.mean[..., 1:], track.covariance[..., 1:, 1:]
         ellipse = arrival_ellipse(gradient, covariance, memory["weights"][:, self.elements], self.radius_km)
         return unvisited(displacement, memory["visited"], ellipse)
-
-    def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Return distance [km] and turn [rad] of a leg in a direction ``(N, 2)`` northward and eastward."""
-        heading = seen["heading"].squeeze(-1).double()
-        wanted = torch.atan2(direction[:, 1], direction[:, 0])
-        return steer(heading, wanted, distance, self.max_leg_km, self.max_turn_rad)
 
 
 def last_leg(seen: TensorDictBase) -> Tensor:
