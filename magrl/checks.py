@@ -15,11 +15,8 @@ from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor
-
-LARGEST = 2.0**64
-"""Numbers of arguments and files are below: also float32 holds their squares."""
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -159,10 +156,8 @@ def check_number(
 
 
 def _is_finite(value: object, kind: type = Real) -> bool:
-    """Return whether a value is a number of a kind below :data:`LARGEST`, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, kind):
-        return False
-    return abs(value) < LARGEST  # type: ignore[arg-type]
+    """Return whether a value is a finite number of a kind, and not a bool."""
+    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
 
 
 def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> None:
@@ -253,18 +248,6 @@ class CheckedModel(BaseModel):
             super().__init__(**values)
         except ValidationError as error:
             raise ValueError("; ".join(dict.fromkeys(map(self._sentence, error.errors())))) from None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _not_too_large(cls, values: Any) -> Any:
-        numbers = list(values.items()) if isinstance(values, dict) else []
-        while numbers:
-            name, value = numbers.pop()
-            if isinstance(value, (list, tuple)):
-                numbers += [(name, each) for each in value]
-            elif isinstance(value, Real) and LARGEST <= abs(value) < math.inf:  # type: ignore[operator]
-                raise ValueError(f"{name} must be below {LARGEST:.3g}, got {short(value)}")
-        return values
 
     def replace(self, **values: Any) -> Self:
         """Return a copy with other values, validated again; what was not given keeps its default."""

@@ -126,10 +126,9 @@ NUMBERS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_numbers_whose_squares_are_infinite_are_refused(name: str, tmp_path: Path) -> None:
-    """An infinite bias would mean a compass."""
+def test_numbers_that_no_float_holds_are_refused(name: str, tmp_path: Path) -> None:
     (read, text), path = NUMBERS[name], tmp_path / name
-    for number in (f"1{'0' * 400}", "1e20", f"-1{'0' * 400}"):
+    for number in (f"1{'0' * 400}", f"-1{'0' * 400}"):
         path.write_text(text.format(number), encoding="utf-8")
         with pytest.raises(ValueError, match=f"^(cannot read )?{path}"):
             read(path)

@@ -95,8 +95,6 @@ def test_other_files_are_not_resumed(tmp_path: Path) -> None:
         (f'{{{MINE}, "name": 5}}', "name must be a text of printable characters, got 5"),
         (f'{{{MINE}, "name": "a\\u001b[2J"}}', r"name must be a text of printable characters, got 'a\\x1b"),
         (f'{{{MINE}, "zeta": NaN}}', "zeta must be a finite number, got nan"),
-        (f'{{{MINE}, "noise": [0, 0, 1{"0" * 400}]}}', r"noise must be below 1\.84e\+19, got 1000"),
-        (f'{{{MINE}, "noise": [0, 0, 1e308]}}', r"noise must be below 1\.84e\+19, got 1e\+308"),
         ("[]", "not of this version of magrl: start the training again in a new folder"),
         ('{"recipe": "ppo.py"}', r"the run was started by ppo\.py: resume it with that recipe"),
         (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
