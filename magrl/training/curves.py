@@ -257,16 +257,11 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
     Args:
         rows: rows of a ``train.csv``; missing values and NaN are left out.
 
-    Raises:
-        ValueError: for no row, or a row without ``frames``.
-
     Example:
         >>> rows = [{"frames": 1000, "return": -5.0}, {"frames": 2000, "return": 20.0, "success_rate": 10.0}]
         >>> [axes.get_title() for axes in training_figure(rows).axes]
         ['return', 'return by term', 'success [%]', 'loss']
     """
-    if not rows or not all("frames" in row for row in rows):
-        raise ValueError(f"each row of a training must have frames, got {list(rows)[:1]}")
     from matplotlib.figure import Figure  # slow to import
     from matplotlib.ticker import EngFormatter
 
