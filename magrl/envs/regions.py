@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from magrl import paper
-from magrl.checks import check_number, check_numbers, check_type
+from magrl.checks import check_number, check_type
 from magrl.field.bank import FieldBank, check_index, checked_boxes
 from magrl.field.model import Float64Module
 from magrl.geodesy import MEAN_RADIUS_KM, check_box, geodesic, wrap_longitude
@@ -38,7 +38,6 @@ class Region:
     longitude: tuple[float, float]
 
     def __post_init__(self) -> None:
-        check_numbers(2, latitudes=self.latitude, longitudes=self.longitude)
         check_box(self.latitude, self.longitude)
         object.__setattr__(self, "latitude", tuple(float(x) for x in self.latitude))
         object.__setattr__(self, "longitude", tuple(float(x) for x in self.longitude))

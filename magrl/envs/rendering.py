@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
 from magrl.envs.regions import Region, Regions, one_region
 from magrl.field.elements import NAMES, UNITS
 from magrl.field.model import FieldModel, device_of, elements_at
@@ -126,9 +126,6 @@ def draw_tracks(
         targets: ``(len(paths), 2)`` [deg].
         outlines: of areas, each ``(P, 2)`` [deg].
 
-    Raises:
-        ValueError: for an empty list of paths, or another number of targets.
-
     Example:
         >>> from matplotlib.figure import Figure
         >>> from magrl.field import IGRF
@@ -139,9 +136,6 @@ def draw_tracks(
         'longitude [° E]'
     """
     region = one_region(region)
-    check_tensor(2, targets=targets)
-    if not len(paths) or targets.shape != (len(paths), 2):
-        raise ValueError(f"there must be one target for each path, got {len(paths)} and {tuple(targets.shape)}")
     unwrapped, ends = [region.unwrapped(path) for path in paths], region.unwrapped(targets)
     draw_contours(axes, field, region.holding(torch.cat([*unwrapped, ends])))
     for ring in outlines:
