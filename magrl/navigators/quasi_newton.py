@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_numbers, check_type
+from magrl.checks import check_number, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES, element_index
 from magrl.field.model import FieldModel, elements_gradient_at
@@ -139,7 +139,6 @@ def estimated_displacement(
         >>> estimated_displacement(track, torch.tensor([3.0, 4.0]), 1000.0, none, none, none).mean.round()
         tensor([300., 200.])
     """
-    check_number(0, above=True, range_km=range_km)
     slopes, eye = track.mean[..., 1:], torch.eye(2).to(track.mean)
     left = wrapped(target.to(slopes) - track.mean[..., 0], periods)
     value = track.covariance[..., 0, 0] + bias_std.to(slopes).square()
@@ -341,7 +340,6 @@ def probe_length(noise: Sequence[float]) -> float:
         >>> [round(probe_length(std), 1) for std in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
         [0.5, 6.1, 11.2, 17.7]
     """
-    check_numbers(3, 0, noise=noise)
     length = float(sensor_length(torch.tensor(noise, dtype=torch.float64)))
     return max(SHORTEST_PROBE_KM, 5.0 * length ** (2 / 3))
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
 from magrl.tracking.destination import Destination, unit_points
@@ -95,7 +94,6 @@ def arrival_decision(
         >>> arrival_decision(goal, posterior(goal), errors, trip, radius_km=25.0).probability > 0.8
         tensor(True)
     """
-    check_number(0, above=True, radius_km=radius_km)
     probability, displacement = posterior.within(radius_km), posterior.aim(radius_km).to(goal.field)
     counts = torch.tensor((_NONE, *READINGS)).to(displacement)
     readings = counts[1:]

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number
 from magrl.field.elements import field_vector
 from magrl.geodesy import geodesic
 from magrl.sensor_std import PERFECT, SensorStd
@@ -106,7 +105,6 @@ def destination(
         >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
         tensor(4., dtype=torch.float64)
     """
-    check_number(0, above=True, range_km=range_km)
     field, crust, between = field_vector(elements.double()), torch.as_tensor(crust_nt).to(belief.mean), None
     noise, share = torch.full_like(crust, MODEL_NT**2), torch.zeros_like(belief.covariance[..., :3, :3])
     if place is not None:

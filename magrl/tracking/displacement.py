@@ -7,8 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number
-
 _AT_ONCE = 13  # legs whose distances to all points are held at once
 _CANDIDATES = 16  # points among which that with most mass around it is chosen
 ELSEWHERE_KM = 10_000.0  # distance of a destination that is not within reach, half of the farthest
@@ -114,7 +112,6 @@ class DestinationPosterior(NamedTuple):
 
     def within(self, radius_km: float) -> Tensor:
         """Return the probability ``(...)`` that the place is within a radius [km] of the vehicle."""
-        check_number(0, above=True, radius_km=radius_km)
         return (self.weights * (self.points.norm(dim=-1) <= radius_km)).sum(-1) * self.reached
 
     def radius(self, probability: float) -> Tensor:
@@ -127,7 +124,6 @@ class DestinationPosterior(NamedTuple):
             >>> DestinationPosterior(points, torch.tensor([0.25, 0.75])).radius(0.7)
             tensor(10.)
         """
-        check_number(0, 1, probability=probability)
         distance, order = self.points.norm(dim=-1).sort(-1)
         wanted = probability / torch.as_tensor(self.reached).to(distance).unsqueeze(-1)
         held = self.weights.gather(-1, order).cumsum(-1)

@@ -8,7 +8,6 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number
 from magrl.field import IGRF
 from magrl.field.elements import measured_elements
 from magrl.field.igrf import Date, igrf_coefficients, parse_date
@@ -151,7 +150,6 @@ def secular_variance(years: float, predicted: bool = False) -> Tensor:
         >>> bool(secular_variance(20.0)[1] > secular_variance(5.0)[1])
         True
     """
-    check_number(0, years=years)
     epochs, gauss = _history()
     change = gauss[1:] - gauss[:-1]
     if predicted:

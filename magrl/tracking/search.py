@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from magrl import guidance
-from magrl.checks import check_number
 from magrl.tracking.displacement import Displacement
 
 VISITED = 24
@@ -115,7 +114,6 @@ def arrival_weights(field: Tensor, target_field: Tensor, zeta: float) -> Tensor:
         >>> arrival_weights(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([2.0, 60.0, 20100.0]), 0.25)
         tensor([1.0000e+00, 2.5000e+01, 4.0000e-04])
     """
-    check_number(0, above=True, zeta=zeta)
     return guidance.objective_weights(field, target_field, field.new_tensor(guidance.OBJECTIVE_FLOORS)) / zeta
 
 

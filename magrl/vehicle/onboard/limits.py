@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_number
 from magrl.field.elements import FIELD_NT, NAMES, UNITS
 from magrl.tracking.planning import MISSING_KM, SLOPES
 
@@ -157,8 +157,6 @@ def check_earth_jump(
         ValueError: inclination changed from 40 to -40 deg over 50 km, by 41955 nT of the field vector; a leg of this \
 length explains at most 5000 nT: the reading is wrong, or the distance is
     """
-    check_numbers(3, before=before, after=after, noise=noise)
-    check_number(0, distance_km=distance_km, noise=min(noise))
     horizontal = min(before[2], after[2])
     total = min(TOTAL_NT[1], *(b / max(math.cos(math.radians(i)), 1e-6) for _, i, b in (before, after)))
     radius = 2 * horizontal, 2 * total, 1.0
