@@ -13,6 +13,7 @@ from magrl.sensor_std import SensorStd
 from magrl.tracking.destination import Destination, unit_points
 from magrl.tracking.displacement import DestinationPosterior
 from magrl.tracking.forecast import covariance_after
+from magrl.tracking.local import cholesky2
 
 # Chosen on random planets.
 STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
@@ -160,9 +161,7 @@ def _within(covariance: Tensor, apart: Tensor, radius_km: float) -> Tensor:
     """Return the probability ``(..., K, J)`` that a place is within a radius of the vehicle, where its estimate has an
     error of covariances ``(..., K, 2, 2)`` and is at displacements ``(..., J, 2)`` [km]."""
     x, y = unit_points(512)[0].to(covariance).unbind(-1)
-    first = covariance[..., :1, 0].clamp_min(1e-6).sqrt()  # Cholesky factor
-    below = covariance[..., :1, 1] / first
-    second = (covariance[..., 1:, 1] - below * below).clamp_min(1e-6).sqrt()
+    first, below, second = cholesky2(covariance.unsqueeze(-3), 1e-6)
     north, east = first * x, below * x + second * y  # (..., K, 128)
     dn, de = (part[..., None, :, None] for part in apart.unbind(-1))
     square = (dn + north.unsqueeze(-2)).square() + (de + east.unsqueeze(-2)).square()

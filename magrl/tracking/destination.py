@@ -25,7 +25,7 @@ from magrl.tracking.anomalies import crust_correlation, crust_share
 from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief
 from magrl.tracking.displacement import DestinationPosterior, Displacement
 from magrl.tracking.harmonics import UNIT_KM, constant, powers, turning
-from magrl.tracking.local import COEFFICIENTS, levers, monomial_rows, unturned
+from magrl.tracking.local import COEFFICIENTS, cholesky2, levers, monomial_rows, unturned
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
 
 RANGE_KM = 400.0
@@ -228,11 +228,9 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
 def _normal(displacement: Displacement, count: int) -> DestinationPosterior:
     """Return points of a normal distribution, of equal weights."""
     points = unit_points(4 * count)[0].to(displacement.mean)
-    first = displacement.covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt()
-    below = displacement.covariance[..., 0, 1] / first
-    second = (displacement.covariance[..., 1, 1] - below * below).clamp_min(_LEAST_KM**2).sqrt()
+    first, below, second = cholesky2(displacement.covariance.unsqueeze(-3), _LEAST_KM**2)
     x, y = points.unbind(-1)
-    apart = torch.stack((first.unsqueeze(-1) * x, below.unsqueeze(-1) * x + second.unsqueeze(-1) * y), -1)
+    apart = torch.stack((first * x, below * x + second * y), -1)
     apart = apart - apart.mean(-2, keepdim=True)
     places = (displacement.mean.unsqueeze(-2) + apart).float()
     return DestinationPosterior(places, torch.full_like(places[..., 0], 1 / count), torch.ones_like(places[..., 0, 0]))
@@ -391,9 +389,7 @@ def _points(displacement: Displacement, heading: Tensor, count: int) -> tuple[Te
     distance, (cos, sin) = displacement.mean.norm(dim=-1), heading.unbind(-1)
     turn = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)  # columns: along, across
     covariance = turn.mT @ displacement.covariance @ turn * _SPREAD**2
-    first = covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt().unsqueeze(-1)  # Cholesky factor
-    below = covariance[..., 0, 1].unsqueeze(-1) / first
-    second = (covariance[..., 1, 1].unsqueeze(-1) - below * below).clamp_min(_LEAST_KM**2).sqrt()
+    first, below, second = cholesky2(covariance.unsqueeze(-3), _LEAST_KM**2)
     x, y = normal.unbind(-1)
     near = torch.stack((distance.unsqueeze(-1) + first * x, below * x + second * y), -1)
     points = torch.cat((near, around.expand(*near.shape[:-2], *around.shape)), -2)

@@ -127,3 +127,16 @@ def inverse2(matrix: Tensor) -> Tensor:
     """
     nn, ne, ee = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
     return (torch.stack((ee, -ne, -ne, nn), -1) / (nn * ee - ne * ne).unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def cholesky2(matrix: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Cholesky factor of matrices ``(..., 2, 2)``, which may be singular by rounding, as its first, its
+    lower left and its last entry ``(...)``; squares on the diagonal are not below a least one.
+
+    Example:
+        >>> cholesky2(torch.tensor([[4.0, 2.0], [2.0, 10.0]]), 1e-6)
+        (tensor(2.), tensor(1.), tensor(3.))
+    """
+    first = matrix[..., 0, 0].clamp_min(least).sqrt()
+    below = matrix[..., 0, 1] / first
+    return first, below, (matrix[..., 1, 1] - below * below).clamp_min(least).sqrt()

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.tracking.displacement import Displacement
+from magrl.tracking.local import cholesky2
 
 VISITED = 24
 """Number of past places that a search remembers."""
@@ -140,8 +141,6 @@ def arrival_ellipse(gradient: Tensor, covariance: Tensor, weights: Tensor, radiu
 
 
 def _root(matrix: Tensor, least: float = _LEAST_KM2) -> Tensor:
-    """Return the Cholesky factor of matrices ``(..., 2, 2)``, which may be singular by rounding."""
-    first = matrix[..., 0, 0].clamp_min(least).sqrt()
-    below = matrix[..., 0, 1] / first
-    second = (matrix[..., 1, 1] - below * below).clamp_min(least).sqrt()
+    """Return the Cholesky factor of matrices ``(..., 2, 2)``."""
+    first, below, second = cholesky2(matrix, least)
     return torch.stack((first, torch.zeros_like(first), below, second), -1).unflatten(-1, (2, 2))
