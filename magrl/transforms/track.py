@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.envs.utils import make_composite_from_td
 
 from magrl.checks import check_choice, check_type
 from magrl.sensor_std import STD_KEYS, SensorStd
@@ -125,8 +126,8 @@ class TrackField(StatefulTransform):
         """Add the track and the observation."""
         observation_spec = super().transform_observation_spec(observation_spec)
         like = self._leaf(observation_spec, self.in_keys[0])
-        leaves = _leaves(like.dtype)
-        observation_spec[self.out_keys[0]] = _spec(leaves, observation_spec.shape, like.shape[:-1], like.device)
+        leaves = _leaves(like.dtype).to(like.device).expand(like.shape[:-1])
+        observation_spec[self.out_keys[0]] = make_composite_from_td(leaves, unsqueeze_null_shapes=False)
         for key in self.out_keys[1:]:
             self._add(observation_spec, like, key, OBSERVATION_SIZE)
         return observation_spec
@@ -145,17 +146,6 @@ def _record(track: Track, batch: torch.Size) -> TensorDict:
     kept = {key: value for key, value in track._asdict().items() if key != "goal"}
     parts = {key: value if isinstance(value, Tensor) else value._asdict() for key, value in kept.items()}
     return TensorDict(parts, batch_size=batch)
-
-
-def _spec(leaves: TensorDictBase, batch: torch.Size, shape: torch.Size, device: torch.device | None) -> Composite:
-    """Return the spec of nested leaves ``(...)`` for vehicles ``shape``."""
-    specs = {
-        key: _spec(leaf, batch, shape, device)
-        if isinstance(leaf, TensorDictBase)
-        else Unbounded((*shape, *leaf.shape), dtype=leaf.dtype, device=device)
-        for key, leaf in leaves.items()
-    }
-    return Composite(specs, shape=batch, device=device)
 
 
 def _read_keys(optional: Sequence[str]) -> tuple[str, ...]:
