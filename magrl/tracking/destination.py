@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from magrl.field.elements import field_vector
-from magrl.geodesy import geodesic
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.anomalies import crust_correlation, crust_share
 from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief
-from magrl.tracking.displacement import DestinationPosterior, Displacement
+from magrl.tracking.displacement import DestinationPosterior, Displacement, displacement_between
 from magrl.tracking.harmonics import UNIT_KM, constant, powers, turning
 from magrl.tracking.local import COEFFICIENTS, cholesky2, levers, monomial_rows, unturned
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
@@ -108,8 +107,7 @@ def destination(
     field, crust, between = field_vector(elements.double()), torch.as_tensor(crust_nt).to(belief.mean), None
     noise, share = torch.full_like(crust, MODEL_NT**2), torch.zeros_like(belief.covariance[..., :3, :3])
     if place is not None:
-        distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
-        apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+        apart = displacement_between(belief.place, place)
         between = Displacement(apart, belief.covariance[..., PLACE, PLACE] + torch.eye(2).to(apart) * (place_km**2 / 2))
     else:
         noise, share = noise + _variance(field, std), crust_share(belief.field, errors, crust)

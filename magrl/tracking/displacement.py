@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from magrl.geodesy import geodesic
+
 _AT_ONCE = 13  # legs whose distances to all points are held at once
 _CANDIDATES = 16  # points among which that with most mass around it is chosen
 ELSEWHERE_KM = 10_000.0  # distance of a destination that is not within reach, half of the farthest
@@ -129,3 +131,15 @@ class DestinationPosterior(NamedTuple):
         held = self.weights.gather(-1, order).cumsum(-1)
         first = (held < wanted).sum(-1, keepdim=True).clamp_max(held.shape[-1] - 1)
         return torch.where(wanted > 1, ELSEWHERE_KM, distance.gather(-1, first)).squeeze(-1)
+
+
+def displacement_between(start: Tensor, end: Tensor) -> Tensor:
+    """Return the displacement ``(..., 2)`` northward and eastward [km] along the geodesic between places ``(..., 2)``,
+    latitude and longitude [deg], in float64.
+
+    Example:
+        >>> displacement_between(torch.tensor([0.0, 160.0]), torch.tensor([0.0, 161.0])).round()
+        tensor([  0., 111.], dtype=torch.float64)
+    """
+    distance, bearing = geodesic(*start.double().unbind(-1), *end.to(start.device).double().unbind(-1))
+    return distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)

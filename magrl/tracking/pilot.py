@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from magrl.field.elements import element_difference
-from magrl.geodesy import geodesic, steer
+from magrl.geodesy import steer
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import anomalies
 from magrl.tracking.belief import (
@@ -44,7 +44,7 @@ from magrl.tracking.belief import (
 )
 from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
 from magrl.tracking.destination import Destination, destination, posterior
-from magrl.tracking.displacement import Displacement
+from magrl.tracking.displacement import Displacement, displacement_between
 from magrl.tracking.earth import EarthModel
 from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
@@ -199,8 +199,7 @@ def position_fix(belief: Belief, place: Tensor, std_km: float) -> Innovation:
         place: ``(..., 2)`` latitude, longitude [deg] of the fix.
         std_km: its root mean square error [km].
     """
-    distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
-    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) - belief.mean[..., PLACE]
+    apart = displacement_between(belief.place, place) - belief.mean[..., PLACE]
     rows = torch.zeros_like(belief.covariance[..., :3, :])
     rows[..., :2, PLACE] = torch.eye(2).to(rows)
     noise = torch.diag(rows.new_tensor((std_km**2 / 2, std_km**2 / 2, 1.0)))

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from magrl.field.elements import element_difference, elements_jacobian, measured_elements
-from magrl.geodesy import geodesic
 from magrl.sensor_std import SensorStd
 from magrl.tracking.anomalies import crust_correlation, crust_share
 from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief, Innovation, settled, updated
+from magrl.tracking.displacement import displacement_between
 from magrl.tracking.earth import EarthModel
 from magrl.tracking.harmonics import UNIT_KM
 from magrl.tracking.local import COEFFICIENTS, levers, slopes, unturned
@@ -95,8 +95,7 @@ def _rows(
 ) -> tuple[Tensor, Tensor]:
     """Return the derivatives ``(..., 3, S)`` of the field's difference from the model at the destination with respect
     to the state, in the axes there, and the variance ``(...)`` in each axis of what the state does not hold."""
-    distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
-    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) / UNIT_KM
+    apart = displacement_between(belief.place, place) / UNIT_KM
     square, axes = apart.square().sum(-1), torch.eye(3).to(apart).expand(*apart.shape[:-1], 3, 3)
     carried = torch.stack(unturned(axes, belief.latitude, apart.unsqueeze(-2).expand(*axes.shape[:-1], 2))[0], -1)
     rows, rho = torch.zeros_like(belief.covariance[..., :3, :]), crust_correlation(square)

@@ -16,6 +16,8 @@ from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import geodesic, move_place, polar, to_ecef
 from magrl.guidance import displacement_to
 from magrl.sensor_std import STD_KEYS
+from magrl.tracking.displacement import displacement_between
+from magrl.transforms.areas import turned
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.sequences import per_nanotesla
 
@@ -172,7 +174,7 @@ class RecentLegs(StatefulTransform):
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         fix, target, command, heading, _ = values
         legs, before = state
-        moved, left = _displacement(before, fix), _displacement(fix, target)
+        moved, left = displacement_between(before, fix), displacement_between(fix, target)
         distance, course = command[..., :1].double(), heading.double()
         through = distance * torch.cat((torch.cos(course), torch.sin(course)), -1)
         drift = (moved - through) / distance.clamp_min(1.0)
@@ -181,11 +183,11 @@ class RecentLegs(StatefulTransform):
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], legs: Tensor) -> None:
         fix, target, _, heading, step = values
-        displacement, back = _displacement(fix, target), -heading.double()
-        distance, (ahead, right) = displacement.norm(dim=-1, keepdim=True), _turned(displacement, back).split(1, -1)
+        displacement, back = displacement_between(fix, target), -heading.double()
+        distance, (ahead, right) = displacement.norm(dim=-1, keepdim=True), turned(displacement, back).split(1, -1)
         places, drifts, known = legs.split((2, 2, 1), -1)
         places, back = places - displacement.unsqueeze(-2), back.unsqueeze(-2)
-        seen = torch.cat((_turned(places, back) / LEG_KM, _turned(drifts, back), known), -1)
+        seen = torch.cat((turned(places, back) / LEG_KM, turned(drifts, back), known), -1)
         bearing = torch.cat((ahead, right), -1) / distance.clamp_min(1e-6)
         share = step.double() / self.max_steps
         parts = bearing, distance / FAR_KM, torch.log(distance / NEAR_KM + 0.1), share, (seen * known).flatten(-2)
@@ -199,15 +201,3 @@ class RecentLegs(StatefulTransform):
         shape = (*place.shape[:-1], self.count, 5)
         observation_spec[self.out_keys[1]] = Unbounded(shape, device=place.device, dtype=place.dtype)
         return observation_spec
-
-
-def _displacement(start: Tensor, end: Tensor) -> Tensor:
-    """Return the displacement ``(..., 2)`` northward and eastward [km] between places ``(..., 2)``."""
-    distance, bearing = geodesic(*start.double().unbind(-1), *end.double().unbind(-1))
-    return distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
-
-
-def _turned(vector: Tensor, angle: Tensor) -> Tensor:
-    """Return vectors ``(..., 2)`` turned clockwise by angles ``(..., 1)`` [rad]."""
-    (north, east), cosine, sine = vector.split(1, -1), torch.cos(angle), torch.sin(angle)
-    return torch.cat((cosine * north - sine * east, sine * north + cosine * east), -1)
