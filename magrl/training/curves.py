@@ -229,13 +229,10 @@ class RunLog:
         write_with(path, figure.savefig, dpi=120)
         self._log.picture(name, path)
 
-    def result(self, result: Mapping[str, float], navigator: str = "") -> None:
-        """Write ``eval.json``; wandb also gets a row of its table of navigators, final values and the policy."""
+    def result(self, result: Mapping[str, float]) -> None:
+        """Write ``eval.json``; wandb also gets the final values."""
         write_json(self.folder / "eval.json", result)
-        self._log.table("eval/navigators", [{"navigator": navigator, **result}])
         self._log.summary({f"final/{key}": value for key, value in result.items()})
-        if (self.folder / "policy.safetensors").is_file():
-            self._log.artifact(self.folder / "policy.safetensors", {"navigator": navigator, **result})
 
     def state_dict(self) -> dict[str, Any]:
         """Return the rows so far, the training time, and the id of the run in wandb."""

@@ -348,7 +348,7 @@ class Run:
             shown = rollout if self._scenario_env is None else evaluation_rollout(self._scenario_env, self.policy)
             figure = maps.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
             self.log.figure("trajectories", figure)
-        self.log.result(result, navigator=self.name)
+        self.log.result(result)
         self.checkpoints.clear()
         self._report(result)
         return result

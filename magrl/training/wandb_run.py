@@ -9,15 +9,12 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import re
 import shutil
 import sys
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
-
-from magrl.files import json_ready
 
 WANDB_PROJECT = "magrl"
 """Project of the runs, unless the environment variable WANDB_PROJECT is set."""
@@ -124,21 +121,6 @@ class WandbRun:
         """Log an image file."""
         self._log(lambda run: run.log({f"figures/{name}": _wandb().Image(str(path))}))
 
-    def table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Log a table with the columns of its first row; NaN is an empty cell."""
-        cells = {"columns": list(rows[0]), "data": json_ready([list(row.values()) for row in rows])}
-        self._log(lambda run: run.log({name: _wandb().Table(**cells, allow_mixed_types=True)}))
-
-    def artifact(self, path: Path, metadata: Mapping[str, Any]) -> None:
-        """Log a model, named after its file and the run folder; wandb refers to the file and keeps no copy."""
-
-        def log(run: Any) -> None:
-            name = re.sub(r"[^\w.-]", "-", f"{path.stem}-{self.folder.name}", flags=re.ASCII)[:128]
-            model = _wandb().Artifact(name, "model", metadata=json_ready(metadata))
-            model.add_file(str(path.absolute()), policy="immutable", skip_cache=True)
-            run.log_artifact(model)
-
-        self._log(log)
 
     def close(self) -> None:
         """Finish the run, and remove the debug logs of wandb, which hold paths of the machine."""

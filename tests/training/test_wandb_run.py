@@ -87,8 +87,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for row in ROWS:
             log.row(row)
         log.figure("trajectories", Figure())
-        (folder / "policy.safetensors").write_bytes(b"weights")
-        log.result({"spl": 97.5, "steps": float("nan"), "num_tasks": 3}, navigator="a-navigator")
+        log.result({"spl": 97.5, "steps": float("nan"), "num_tasks": 3})
         log.close()
     return folder
 
@@ -109,29 +108,18 @@ def test_run_and_its_curves(finished: Path) -> None:
     assert not any("success_rate" in row for row in curves), "NaN is not a point of a curve"
 
 
-def test_table_picture_policy_and_final_values(finished: Path) -> None:
-    offline, row = only(finished), {"navigator": "a-navigator", "spl": 97.5, "steps": None, "num_tasks": 3}
-    (path,) = (row["eval/navigators.path"] for row in offline.history if "eval/navigators.path" in row)
-    table = json.loads((offline.folder / "files" / path).read_text(encoding="utf-8"))
-    assert [dict(zip(table["columns"], cells, strict=True)) for cells in table["data"]] == [row]
+def test_picture_and_final_values(finished: Path) -> None:
+    offline = only(finished)
     assert 97.5 in [values(record.update).get("final/spl") for record in offline.records["summary"]]
     (picture,) = (row["figures/trajectories.path"] for row in offline.history if "figures/trajectories.path" in row)
     assert (offline.folder / "files" / picture).read_bytes() == (finished / "trajectories.png").read_bytes()
-    (model,) = (artifact for artifact in offline.records["artifact"] if artifact.type == "model")
-    (entry,) = model.manifest.contents
-    assert (model.name, json.loads(model.metadata)) == ("policy-a-run-1", row)
-    assert (Path(entry.local_path), entry.size) == (finished / entry.path, len(b"weights"))
 
 
 def test_nothing_about_the_machine_is_logged(finished: Path) -> None:
-    """Except the paths of artifacts, which `wandb sync` reads and does not send."""
     private = [b"do-not-tell-anyone", *(os.fsencode(x) for x in (finished.parent, f"{Path.home()}/", os.getcwd()))]
     private += [host] if len(host := socket.gethostname().encode()) > 4 else []
     told = [path.read_bytes() for path in (finished / "wandb").rglob("*") if path.is_file() and path.suffix != ".wandb"]
-    for record in records(next(only(finished).folder.glob("*.wandb"))):
-        for entry in record.artifact.manifest.contents:
-            entry.local_path = ""
-        told.append(record.SerializeToString())
+    told += [record.SerializeToString() for record in records(next(only(finished).folder.glob("*.wandb")))]
     assert len(told) > 10
     for secret in private:
         assert not any(secret in content for content in told), secret
