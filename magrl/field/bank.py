@@ -43,7 +43,6 @@ class FieldBank(Float64Module):
         torch.Size([2, 3])
     """
 
-    shown = ("degree", "error_nt")
     indexed = True
     """Whether an evaluation takes an index."""
     CHUNK = 10240

@@ -125,8 +125,6 @@ class IGRF(SphericalHarmonicField):
         tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
     """
 
-    shown = ("date", "generation", "altitude_km")
-
     def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0) -> None:
         super().__init__(igrf_coefficients(date, generation), altitude_km=altitude_km)
         self.date, self.generation = parse_date(date), generation

@@ -8,7 +8,7 @@ inside and out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor, nn
@@ -47,13 +47,6 @@ class Float64Module(nn.Module):
         >>> isinstance(field, Float64Module), field.value_weights.dtype
         (True, torch.float64)
     """
-
-    shown: ClassVar[tuple[str, ...]] = ()
-    """Attributes that the representation shows."""
-
-    def extra_repr(self) -> str:
-        """Return these attributes as text."""
-        return ", ".join(f"{name}={getattr(self, name)}" for name in self.shown)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)

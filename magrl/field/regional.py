@@ -39,7 +39,6 @@ class RegionalField(Float64Module):
         True
     """
 
-    shown = ("latitude", "longitude", "degree", "error_nt")
     CHUNK = 10240
     """Points evaluated at a time; temporary memory is about 2 kB per point."""
 

@@ -35,7 +35,6 @@ class SphericalHarmonicField(Float64Module):
                 [    0.,     0., 60410.]], dtype=torch.float64)
     """
 
-    shown: ClassVar[tuple[str, ...]] = ("degree", "altitude_km")
     altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 1000.0)
     """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
     CHUNK = 16384

@@ -96,7 +96,6 @@ class WMMHR(SphericalHarmonicField):
         tensor([32140.,  1112., -8271.], dtype=torch.float64)
     """
 
-    shown = ("date", "altitude_km")
     altitude_range_km: ClassVar[tuple[float, float]] = (-1.0, 600.0)
     """Range of altitudes [km]: the sources of the field of the crust are not far below."""
 
