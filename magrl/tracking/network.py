@@ -16,8 +16,6 @@ from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.tracking.observation import OBSERVATION_SIZE
 from magrl.tracking.pilot import Rules
 
-MOST_LAYERS = 64
-"""Largest number of hidden layers."""
 _PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
 
 
@@ -40,7 +38,6 @@ def correction_network(
         tensor([0., 0.], grad_fn=<SelectBackward0>)
     """
     check_type(Sequence, num_cells=num_cells)
-    check_number(1, MOST_LAYERS, whole=True, hidden_layers=len(num_cells))
     layers: list[nn.Module] = []
     width = inputs
     for cells in num_cells:
