@@ -12,7 +12,7 @@ import tyro
 from pydantic import AfterValidator, Field, model_validator
 
 from magrl import paper
-from magrl.checks import CheckedModel, UsageError, check_choice, check_device, printable, short
+from magrl.checks import CheckedModel, UsageError, check_choice, check_device, short
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document
@@ -357,8 +357,7 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
             raise ValueError("it is not of this version of magrl: start the training again in a new folder")
         if (begun := settings.pop("recipe")) != recipe:
             raise ValueError(f"the run was started by {begun}: resume it with that recipe")
-        if (name := settings.pop("name", "")) != printable(name):
-            raise ValueError(f"name must be a text of printable characters, got {short(name)}")
+        settings.pop("name", None)
         if settings.get("scenario"):
             settings["scenario"] = folder / Path(settings["scenario"]).name
         settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}
