@@ -16,7 +16,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from magrl.checks import check_number
 from magrl.files import append, write_json, write_text, write_with
 from magrl.training.wandb_run import WandbRun
 
@@ -130,12 +129,7 @@ class BestPolicy:
         self.weights: dict[str, Tensor] | None = None
 
     def offer(self, score: float, module: nn.Module) -> None:
-        """Keep the weights of ``module`` if their score is the best so far.
-
-        Raises:
-            ValueError: for a score that is not finite: no later score could be compared with it.
-        """
-        check_number(score=score)
+        """Keep the weights of ``module`` if their score is the best so far."""
         if score > self.score:
             tensors = {key: x.clone() for key, x in module.state_dict().items() if isinstance(x, Tensor)}
             self.score, self.weights = score, tensors
