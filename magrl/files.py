@@ -18,7 +18,7 @@ import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 from torch import Tensor
 
-from magrl.checks import UsageError, check_type
+from magrl.checks import UsageError
 
 
 class DamagedFileError(ValueError):
@@ -256,7 +256,6 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         >>> json.loads(path.read_text())
         {'steps': 9, 'spl': None}
     """
-    check_type(Path, path=path)
     write_atomically(path, f"{json.dumps(json_ready(content), indent=2, allow_nan=False)}\n".encode())
 
 

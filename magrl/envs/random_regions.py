@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number
 from magrl.counters import counter_uniform
 from magrl.envs.regions import Regions
 from magrl.envs.scenario import Scenario
@@ -66,7 +66,6 @@ def earth_scenario(
         >>> tasks.start.shape, tasks.region.shape
         (torch.Size([20, 2]), torch.Size([20]))
     """
-    check_type(bool, crust=crust)
     earth = wmmhr_coefficients(date) if crust else igrf_coefficients(date, generation)
     scenario = region_scenario(earth.unsqueeze(0), count, seed, **options)
     return scenario.replace(date=parse_date(date), generation=generation)

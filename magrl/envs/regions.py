@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from magrl import paper
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number
 from magrl.field.bank import FieldBank, check_index, checked_boxes
 from magrl.field.model import Float64Module
 from magrl.geodesy import MEAN_RADIUS_KM, check_box, geodesic, wrap_longitude
@@ -232,14 +232,12 @@ def one_region(region: Region | Regions) -> Region:
     """Return the only region of a scenario, for uses that support one region, such as a map.
 
     Raises:
-        TypeError: for anything else than regions.
         ValueError: for several regions.
 
     Example:
         >>> one_region(Regions.of(PAPER_REGION))
         Region(latitude=(-10.0, 0.0), longitude=(160.0, 170.0))
     """
-    check_type((Region, Regions), region=region)
     regions = Regions.of(region)
     if len(regions) > 1:
         raise ValueError(

@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES, element_index
 from magrl.field.model import FieldModel, elements_gradient_at
@@ -199,7 +199,6 @@ class QuasiNewton(Navigator):
 
     Raises:
         ValueError: for an option out of its range, fewer than two elements, or a negative standard deviation.
-        TypeError: for ``search`` other than a bool.
 
     Source:
         C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp. 19 (1965).
@@ -229,7 +228,6 @@ class QuasiNewton(Navigator):
     ) -> None:
         super().__init__(max_leg_km, max_turn_rad)
         check_number(0, above=True, zeta=zeta)
-        check_type(bool, search=search)
         check_number(0, above=True, optional=True, radius_km=radius_km)
         self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
         self.in_keys = ["field", "target_field", "heading", "leg", "elapsed_steps"]

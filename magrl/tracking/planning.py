@@ -30,7 +30,8 @@ NEAR_KM = 30.0
 SLOPES = (0.004, 0.015, 4.0)
 """Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
 LENGTHS = (0.1, 0.3, 0.6, 1.0)
-"""Lengths of the legs that are compared by default; the whole displacement, if it is shorter, is another."""
+"""Lengths of the legs that are compared, as fractions of the longest; the whole displacement, if it is shorter, is
+another."""
 SHORTEST = 1 / 40
 """The least length of a leg that is compared, as a share of the displacement."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
@@ -106,7 +107,6 @@ def planned_leg(
     step_km: Tensor,
     max_leg_km: float,
     caution: float = CAUTION,
-    lengths: Sequence[float] = LENGTHS,
 ) -> Tensor:
     """Return the displacement ``(..., 2)`` [km] of the next leg, northward and eastward.
 
@@ -126,7 +126,6 @@ def planned_leg(
         step_km: ``(...)`` price of a step [km], see :func:`step_price`.
         max_leg_km: longest leg.
         caution: weight of the uncertainty.
-        lengths: of the legs that are compared, as fractions of the longest; at least :data:`SHORTEST` of the path.
 
     Source:
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
@@ -141,7 +140,7 @@ def planned_leg(
         torch.Size([2])
     """
     aim = aim.to(goal.field)
-    legs = _legs(aim, lengths, max_leg_km)
+    legs = _legs(aim, max_leg_km)
     left = aim.unsqueeze(-2) - legs
     shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
     distance = posterior.mean_distance(legs - shift.unsqueeze(-2)).to(aim.dtype)  # now it is the same for all
@@ -172,11 +171,11 @@ def corrected(displacement: Tensor, correction: Tensor) -> Tensor:
     return torch.exp(stretch).unsqueeze(-1) * torch.stack((cos * x - sin * y, sin * x + cos * y), -1)
 
 
-def _legs(displacement: Tensor, lengths: Sequence[float], max_leg_km: float) -> Tensor:
+def _legs(displacement: Tensor, max_leg_km: float) -> Tensor:
     """Return the displacements ``(..., M, 2)`` [km] that are compared, given the displacement ``(..., 2)``."""
     distance = displacement.norm(dim=-1, keepdim=True)
     whole, least = (x.clamp_max(max_leg_km) for x in (distance, SHORTEST * distance))
-    fixed = torch.maximum(displacement.new_tensor(lengths) * max_leg_km, least)
+    fixed = torch.maximum(displacement.new_tensor(LENGTHS) * max_leg_km, least)
     angles = torch.deg2rad(displacement.new_tensor(ANGLES_DEG))
     bearing = torch.atan2(displacement[..., 1:], displacement[..., :1]) + angles
     directions = torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from magrl.checks import check_numbers, check_tensor, check_type
+from magrl.checks import check_numbers, check_tensor
 from magrl.transforms.base import Keys, ObservationTransform, key_list
 
 
@@ -75,7 +75,6 @@ class MinMaxNorm(ObservationTransform):
             self.register_buffer(f"low_{index}", None)
             self.register_buffer(f"high_{index}", None)
         bounds = {} if bounds is None else bounds
-        check_type(Mapping, bounds=bounds)
         for key, pair in bounds.items():
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
                 raise ValueError(f"the bounds of {key!r} must be (low, high), got {pair!r}")

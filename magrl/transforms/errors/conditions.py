@@ -215,7 +215,6 @@ def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -
 
     Raises:
         ValueError: for an unknown preset, or an environment that does not allow the farthest leg.
-        TypeError: for another environment.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -226,7 +225,6 @@ def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -
     """
     conditions = conditions_named(conditions) if isinstance(conditions, str) else conditions
     check_type(Conditions, conditions=conditions)
-    check_type(EnvBase, env=env)
     if not conditions.errors:
         return env
     env = TransformedEnv(env, Compose(*conditions.transforms(seed)))
