@@ -12,7 +12,7 @@ import tyro
 from pydantic import AfterValidator, Field, model_validator
 
 from magrl import paper
-from magrl.checks import CheckedModel, UsageError, check_choice, check_device, short
+from magrl.checks import CheckedModel, UsageError, check_choice, check_device
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document

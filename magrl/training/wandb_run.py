@@ -121,7 +121,6 @@ class WandbRun:
         """Log an image file."""
         self._log(lambda run: run.log({f"figures/{name}": _wandb().Image(str(path))}))
 
-
     def close(self) -> None:
         """Finish the run, and remove the debug logs of wandb, which hold paths of the machine."""
         self._log(lambda run: run.finish())
