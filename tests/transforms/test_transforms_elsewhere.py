@@ -1,32 +1,33 @@
-"""The transforms in environments of other domains, as docs/transforms.md shows them."""
+"""MinMaxNorm in environments of other domains."""
 
-import importlib
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from torchrl.envs import EnvBase, GymEnv, PendulumEnv, TransformedEnv
 
-sys.path.append(str(Path(__file__).parent.parent.parent / "docs" / "examples"))
-pendulum, classic_control = map(importlib.import_module, ("pendulum", "classic_control"))
-
-
-def test_the_pendulum_example() -> None:
-    assert pendulum.main(pendulum.Config(steps=50)) == 0.0
-    torque = torch.full((5, 1), 0.5)
-    flights = (pendulum.fly(pendulum.make_env(0), scale * torque, 0)["next", "reward"] for scale in (1.0, 1.1))
-    assert not torch.equal(*flights)
+from magrl import MinMaxNorm
 
 
-def test_the_classic_control_example(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = classic_control.main(classic_control.Config(steps=20))
-    assert len(rows) == 2 + 6 + 4
-    assert rows[9].startswith("| CartPole-v1 | 1 | -inf to inf | -3 to 3 |")
-    assert "CartPole-v1: MinMaxNorm needs finite bounds" in capsys.readouterr().out
+def rewards(env: EnvBase, actions: torch.Tensor) -> torch.Tensor:
+    env.set_seed(0)
+    action = iter(actions)
+    return env.rollout(len(actions), lambda td: td.set("action", next(action)))["next", "reward"]
 
 
-def test_numbers_without_bounds_go_on_beyond_the_interval() -> None:
-    env = classic_control.make_env("CartPole-v1", open_bound=0.01)
+def test_a_scaled_torque_has_the_same_dynamics() -> None:
+    env = TransformedEnv(PendulumEnv(), MinMaxNorm(["th"], ["th_scaled"], in_keys_inv=["action"]))
+    torque = 2 * torch.rand(50, 1, generator=torch.Generator().manual_seed(0)) - 1
+    plain = rewards(PendulumEnv(), 2 * torque)
+    assert torch.equal(rewards(env, torque), plain)
+    assert not torch.equal(rewards(env, 0.9 * torque), plain)
+
+
+def test_numbers_without_bounds_need_some_and_go_on_beyond_them() -> None:
+    with pytest.raises(ValueError, match="MinMaxNorm needs finite bounds"):
+        TransformedEnv(GymEnv("CartPole-v1"), MinMaxNorm(["observation"]))
+    high = torch.tensor([4.8, 0.01, 0.42, 0.01])
+    norm = MinMaxNorm(["observation"], ["scaled"], bounds={"observation": (-high, high)})
+    env = TransformedEnv(GymEnv("CartPole-v1"), norm)
     assert env.rollout(10)["scaled"].abs().max() > 1
-    assert env.observation_spec["scaled"].space.high.tolist() == [1.0, math.inf, 1.0, math.inf]
+    assert env.observation_spec["scaled"].space.high[1::2].tolist() == [math.inf] * 2
