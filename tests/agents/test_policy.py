@@ -1,14 +1,13 @@
 """Trained policies as navigators of the plain environment, and their files."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
-from magrl import GeomagneticNavEnv, ObservationView, Scenario
+from magrl import Anywhere, GeomagneticNavEnv, ObservationView, Scenario
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.evaluation.navigators import training_settings
 from magrl.files import load_tensors, save_tensors
@@ -70,52 +69,57 @@ def test_an_actor_of_another_shape_is_not_saved(env, tmp_path: Path) -> None:
     assert not (tmp_path / "policy.safetensors").exists()
 
 
-def config(**change) -> Callable:
-    return lambda content: content | {"config": content["config"] | change}
+REAL = "must hold real numbers of size up to 1e\\+06"
 
 
-def test_damaged_policy_is_refused(policy, tmp_path: Path) -> None:
-    path = tmp_path / "policy.pt"
+@pytest.mark.parametrize("kind", ["region", "anywhere", "memory"])
+def test_damaged_files_of_all_kinds_are_refused(kind: str, policy, tmp_path: Path) -> None:
+    path, other = tmp_path / "policy.safetensors", {"memory": "rules"}.get(kind, "memory")
+    save_policy(path, policy if kind == "region" else load_policy(pretrained(kind)))
+    content = load_tensors(path)
+    weights, name = content["weights"], next(iter(content["weights"]))
     for change, message in (
-        (
-            lambda c: c | {"format": [1] * 10**5},
-            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 6: train it again",
-        ),
-        (lambda c: c | {"extra": 1}, "unexpected keyword argument 'extra'"),
-        (lambda c: c | {"config": {"num_cells": (16,)}}, "view"),
-        (config(num_cells=(8, 8)), "size mismatch for .*weight"),
-        (config(view={}), "does not hold a valid policy"),
-        (lambda c: c | {"weights": {k: v * math.nan for k, v in c["weights"].items()}}, "is not finite"),
+        ({"format": [1] * 10**5}, r"of format \[1, 1, .{70}\.\.\.; this version reads format 6: train it again"),
+        ({"more": 1}, "unexpected keyword argument 'more'"),
+        ({other: {}}, f"unexpected keyword argument '{other}'"),
+        ({"kind": "map"}, "it is of the kind 'map', expected is pilot or memory or "),
+        ({"config": {}}, "does not hold a valid policy"),
+        ({"weights": {}}, "Missing key"),
+        ({"weights": weights | {"more.weight": torch.zeros(1)}}, "more.weight"),
+        ({"weights": weights | {name: weights[name] * math.nan}}, f"{name} is not finite"),
+        ({"weights": weights | {name: weights[name] * 1e38}}, f"{name} {REAL}"),
+        ({"weights": weights | {name: weights[name].to(torch.complex64)}}, f"{name} {REAL}, got torch.complex64"),
     ):
-        save_policy(path, policy)
-        save_tensors(change(load_tensors(path)), path)
+        save_tensors(content | change, path)
         with pytest.raises(ValueError, match=message) as error:
             load_policy(path)
         assert str(path) in str(error.value)
 
 
-@pytest.mark.parametrize("kind", ["policy", "anywhere", "memory"])
-def test_files_of_all_kinds_hold_real_weights_of_one_policy(kind: str, policy, tmp_path: Path) -> None:
-    path, other = tmp_path / "policy.safetensors", {"memory": "rules"}.get(kind, "memory")
-    save_policy(path, policy if kind == "policy" else load_policy(pretrained(kind)))
-    content = load_tensors(path)
-    name = next(iter(content["weights"]))
-    for change, message in (
-        ({name: content["weights"][name] * 1e38}, f"{name} must hold real numbers of size up to 1e\\+06"),
-        (
-            {name: content["weights"][name].to(torch.complex64)},
-            f"{name} must hold real numbers .*, got torch.complex64",
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        ("region", {"view": {}}, "does not hold a valid policy"),
+        ("anywhere", {"rules": {"max_steps": 0}}, "max_steps"),
+        ("anywhere", {"rules": {"speed": 3}}, "speed"),
+        *((kind, {"num_cells": [8, 8]}, r"size mismatch|Missing key") for kind in ("region", "anywhere")),
+        *(
+            (kind, {"num_cells": cells}, "does not hold a valid policy")
+            for kind in ("region", "anywhere")
+            for cells in ((60000, 60000), (10**9,), (0,), ("a",), (1,) * 200_000, ((4,),))
         ),
-        ({"more.weight": torch.zeros(1)}, "more.weight"),
-    ):
-        save_tensors(content | {"weights": content["weights"] | change}, path)
-        with pytest.raises(ValueError, match=message):
-            load_policy(path)
-    for entry in ({"more": 1}, {other: {}}):
-        save_tensors(content | entry, path)
-        with pytest.raises(ValueError, match="does not hold a valid") as error:
-            load_policy(path)
-        assert next(iter(entry)) in str(error.value)
+    ],
+)
+def test_a_policy_of_another_shape_than_its_weights_is_refused(
+    kind: str, change: dict, message: str, policy, tmp_path: Path
+) -> None:
+    """Before its network is made."""
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy if kind == "region" else load_policy(pretrained(kind)))
+    content = load_tensors(path)
+    save_tensors(content | {"config": content["config"] | change}, path)
+    with pytest.raises(ValueError, match=f"{path}.*{message}"):
+        load_policy(path)
 
 
 def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:
@@ -134,8 +138,9 @@ def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:
 
 
 def test_missing_policy_and_foreign_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no policy file at .*none\.pt"):
-        load_policy(tmp_path / "none.pt")
+    for read in (load_policy, lambda path: Anywhere(source=path)):
+        with pytest.raises(FileNotFoundError, match=r"no policy file at .*none\.pt"):
+            read(tmp_path / "none.pt")
     (tmp_path / "text.pt").write_text("not an archive", encoding="utf-8")
     with pytest.raises(ValueError, match="no safetensors file"):
         load_policy(tmp_path / "text.pt")

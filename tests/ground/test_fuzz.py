@@ -12,7 +12,6 @@ from support.networks import network_file
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
-from magrl.files import load_tensors, save_tensors
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
 from magrl.transforms import ReadingView, load_conditions
@@ -132,22 +131,3 @@ def test_numbers_that_no_float_holds_are_refused(name: str, tmp_path: Path) -> N
         path.write_text(text.format(number), encoding="utf-8")
         with pytest.raises(ValueError, match=f"^(cannot read )?{path}"):
             read(path)
-
-
-def test_conditions_of_a_file_have_no_keys(tmp_path: Path) -> None:
-    path = tmp_path / "own.toml"
-    for key in ("in_keys", "out_keys", "seed"):
-        path.write_text(f'sensors.{key} = ["field"]', encoding="utf-8")
-        with pytest.raises(ValueError, match=f"^{path}: SensorErrors has no option '{key}'"):
-            load_conditions(path)
-
-
-def test_policy_that_asks_for_more_than_it_holds(tmp_path: Path) -> None:
-    path = tmp_path / "policy.pt"
-    save_policy(path, small_policy())
-    content = load_tensors(path)
-    for cells in ((60000, 60000), (0,), ("a",), (), (1,) * 200_000, ((4,),)):
-        content["config"]["num_cells"] = cells
-        save_tensors(content, path)
-        with pytest.raises(ValueError, match=f"{path}.* does not hold a valid policy"):
-            load_policy(path)

@@ -14,7 +14,6 @@ import magrl
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
-from magrl.files import load_tensors, save_tensors
 from magrl.navigators import Anywhere, Kalman, policy_env
 from magrl.tracking import Rules
 from magrl.tracking.network import correction_network, pretrained
@@ -74,38 +73,6 @@ def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
     state = policy_env(env, agent).rollout(3)[:, -1]
     wanted, found = (one(state.clone())["action"] for one in (agent, loaded))
     assert torch.equal(found, wanted)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"format": [1] * 10**5}, r"format \[1, 1, .{70}\.\.\.; this version reads format 6: train it again"),
-        ({"rules": {"max_steps": 0}}, "max_steps"),
-        ({"rules": {"speed": 3}}, "speed"),
-        ({"num_cells": [10**9]}, "num_cells must be"),
-        ({"num_cells": [8, 8]}, r"size mismatch|Missing key"),
-        ({"weights": {}}, "Missing key"),
-    ],
-)
-def test_damaged_files_are_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.safetensors"
-    magrl.save_policy(path, Anywhere(source=correction_network((8,))))
-    content = load_tensors(path)
-    config = {"config": content["config"] | {key: change[key] for key in change.keys() & content["config"].keys()}}
-    save_tensors(content | config | {key: change[key] for key in change.keys() & content.keys()}, path)
-    with pytest.raises(ValueError, match=message) as error:
-        Anywhere(source=path)
-    assert str(path) in str(error.value)
-
-
-def test_weights_that_are_not_finite_and_missing_files_are_refused(tmp_path: Path) -> None:
-    path, network = tmp_path / "mine.safetensors", correction_network((8,))
-    torch.nn.init.constant_(network[0].weight, math.nan)
-    magrl.save_policy(path, Anywhere(source=network))
-    with pytest.raises(ValueError, match="is not finite"):
-        Anywhere(source=path)
-    with pytest.raises(FileNotFoundError, match=r"no policy file at .*none"):
-        Anywhere(source=tmp_path / "none.safetensors")
 
 
 def test_every_pretrained_pilot_is_small_and_has_a_card() -> None:

@@ -30,10 +30,14 @@ def first(*values: Any) -> Any:
     return start().step(*values)
 
 
-def later(*values: Any) -> Any:
+def later(*values: Any, **errors: float) -> Any:
     vehicle = start()
     vehicle.step(*HERE, 290.0)
-    return vehicle.step(*values)
+    return vehicle.step(*values, **errors)
+
+
+def fix(*values: float) -> None:
+    start(BERGEN, BERGEN, "kalman", **DATE).fix(*values)
 
 
 ELEMENTS = {
@@ -72,7 +76,8 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (start, (TARGET, (60.4, 5.3)), DATE | {"model": None}, "start .* is a place, which needs a model"),
     (start, (TARGET, (60.4,)), DATE, "start must be D, I and B_H, or latitude and longitude"),
     (start, (TARGET, (95.0, 5.3)), DATE, "latitude must be a finite number from -90 up to 90, got 95"),
-    (start, (TARGET, (60.4, 5.3)), DATE | {"start_km": 200.0}, "start_km must be less than or equal to 100"),
+    (start, (TARGET, (60.4, 5.3)), DATE | {"start_km": 101.0}, "start_km must be less than or equal to 100"),
+    (start, (BERGEN, BERGEN), DATE | {"target_km": 1e18}, "target_km must be less than or equal to 100"),
     (start, (TARGET, (60.4, 5.3)), {"date": "2031-06-30"}, "IGRF-14 is valid to 2030, not in 2031.5: give a newer one"),
     (start, (TARGET, (60.4, 5.3)), DATE | {"model": "IGRF-13"}, "IGRF-13"),
     (start, (TARGET, (60.4, 5.3)), DATE | {"model": "WMM"}, "WMM"),
@@ -96,6 +101,9 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (later, (*HERE, 290.0, 30000.0), {}, "distance 30000 km is longer than the longest leg of this vehicle, 50 km"),
     (later, (3.5, 73.0, 21000.0, 290.0, 40.0), {}, r"B_H changed from 15000 to 21000 nT over 40 km.*at most 44"),
     (later, (40.0, 73.0, 15000.0, 290.0, 20.0), {}, "declination changed from 3.5 to 40 deg over 20 km"),
+    (later, (*HERE, 290.0, 20.0), {"distance_std": 1e5}, "distance_std must be less than or equal to 100, got 100000"),
+    (later, (*HERE, 290.0, 40.0), {"distance_std": 60.0}, "distance_std 60 km is more than a leg of 40 km allows, 41"),
+    (fix, (60.4, 4.6, 1e18), {}, "std_km must be less than or equal to 100, got 1e[+]18"),
 ]
 """Doors, arguments, and messages."""
 

@@ -52,11 +52,6 @@ def test_order_of_the_errors() -> None:
     assert [type(part) for part in CONDITIONS["low-cost"].transforms()] == order
 
 
-def test_an_environment_that_is_too_small_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"drift_km=3\.\d+"):
-        with_conditions(nav(2), "ship")
-
-
 class TypicalField(nn.Module):
     """The field that data sheets are stated for, everywhere."""
 
@@ -217,6 +212,7 @@ def test_own_errors_in_a_file() -> None:
         ),
         ("sensors.bais = [1, 1, 1]", r"SensorErrors has no option 'bais': choose from noise, bias, .*levels, stated$"),
         ("sensors.seed = 3", r"SensorErrors has no option 'seed'"),
+        ("sensors.in_keys = ['field']", r"SensorErrors has no option 'in_keys'"),
         ("spikes.rates = 0.1", r"Spikes has no option 'rates': choose from sizes, rate, stated$"),
         ("spikes.rate = 0.1", r"mine\.toml: Spikes.*missing.*'sizes'"),
         ("motion.speed_km_h = 3", r"MotionError has no option 'speed_km_h'"),
