@@ -1,20 +1,17 @@
-"""TorchRL's conformance list for all transforms by two tables: in environments, and on data."""
+"""TorchRL's conformance list for all transforms in environments."""
 
 import copy
-import math
 import pickle
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import pytest
 import torch
-from support.environments import parallel
-from support.errors import all_errors, every_error, field, nav, sensor_errors
+from support.environments import paper_field, parallel
+from support.errors import all_errors, every_error, nav, sensor_errors
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.testing import assert_close
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase, PendulumEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -53,7 +50,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are autom
 def guided() -> Transform:
     """Every transform of a guided agent at once, in the order of use."""
     return Compose(
-        FieldGradient(field()),
+        FieldGradient(paper_field()),
         GradientHeading(pair="auto"),
         AlignmentReward(out_keys=["reward", "reward_alignment"]),
         DistanceCost(0.01),
@@ -157,91 +154,6 @@ def test_a_step_in_another_process_starts_from_the_state_that_it_is_sent() -> No
         env.close()
 
 
-class DataCase(NamedTuple):
-    transform: Callable[[], Transform]
-    inputs: Callable[[Callable[..., Tensor]], dict[str, Tensor]]  # from a source of uniform numbers in [0, 1)
-    outputs: Callable[[dict[str, Tensor]], dict[str, Tensor]]  # computed another way
-
-
-def deviation(angle: Tensor, reference: Tensor) -> Tensor:
-    """Return the angle between two arrows, in [0, pi]."""
-    return torch.acos(torch.cos(angle.double() - reference.double()))
-
-
-DATA_CASES = {
-    "MinMaxNorm": DataCase(
-        lambda: MinMaxNorm(["x"], ["y"], bounds={"x": (torch.tensor([0.0, -2.0]), torch.tensor([10.0, 2.0]))}),
-        lambda rand: {"x": 20 * rand(2) - 5},
-        lambda td: {"y": torch.stack((td["x"][..., 0] / 5 - 1, td["x"][..., 1] / 2), -1)},
-    ),
-    "AngleVector": DataCase(
-        lambda: AngleVector(["x"], ["y"]),
-        lambda rand: {"x": 8 * rand(1) - 4},
-        lambda td: {"y": torch.cat((torch.sin(td["x"] + math.pi / 2), torch.sin(td["x"])), -1)},
-    ),
-    "TargetDifference": DataCase(
-        lambda: TargetDifference(["x", "x_there"], ["y"]),
-        lambda rand: {"x": rand(3), "x_there": rand(3)},
-        lambda td: {"y": -(td["x"] - td["x_there"])},
-    ),
-    "AlignmentReward": DataCase(
-        lambda: AlignmentReward(["angle", "reference", "ok"], ["r", "term"], weight=2.0, offset=0.5),
-        lambda rand: {
-            "angle": 3 * rand(1),
-            "reference": 3 * rand(1) - 3,
-            "ok": rand(1) > 0.3,
-            "next": TensorDict(angle=3 * rand(1), reference=3 * rand(1) - 3, r=rand(1)),
-        },
-        lambda td: {
-            ("next", "term"): td["ok"] * 2.0 * (0.5 - deviation(td["next"]["angle"], td["reference"])),
-            ("next", "r"): td["next"]["r"] + td["ok"] * 2.0 * (0.5 - deviation(td["next"]["angle"], td["reference"])),
-        },
-    ),
-}
-
-
-def data_of(case: DataCase, *batch: int, dtype: torch.dtype = torch.float32) -> tuple[TensorDict, dict]:
-    """Return a TensorDict of inputs, and what the transform must add to it or change in it."""
-    draw = torch.Generator().manual_seed(0)
-    inputs = case.inputs(lambda *shape: torch.rand(*batch, *shape, dtype=dtype, generator=draw))
-    return TensorDict(inputs, batch), case.outputs(copy.deepcopy(inputs))
-
-
-def check_outputs(td: TensorDict, expected: dict) -> None:
-    for name, value in expected.items():
-        assert_close(td[name], value.to(td[name].dtype), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("case", DATA_CASES.values(), ids=DATA_CASES.keys())
-class TestConformanceOnData:
-    @pytest.mark.parametrize(("batch", "dtype"), [((), torch.float32), ((2, 3), torch.float64)])
-    def test_transform_no_env(self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype) -> None:
-        td, expected = data_of(case, *batch, dtype=dtype)
-        given, tensors = td.clone(), dict(td.items(True, True))
-        out = Compose(case.transform())(td)
-        check_outputs(out, expected)
-        assert all(out[name].dtype in (dtype, torch.bool) for name in expected)
-        for name in given.keys(True, True):
-            assert name in expected or torch.equal(out[name], given[name]), name
-            assert torch.equal(tensors[name], given[name]), f"{name} was written in place"
-
-    def test_transform_rb(self, case: DataCase) -> None:
-        td, expected = data_of(case, 10)
-        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=7)
-        buffer.append_transform(case.transform())
-        buffer.extend(td.set("row", torch.arange(10)))
-        for _ in range(2):  # the second sample shows that the first was not written back into the storage
-            sample = buffer.sample()
-            check_outputs(sample, {name: value[sample["row"]] for name, value in expected.items()})
-
-    def test_a_missing_key_is_named(self, case: DataCase) -> None:
-        transform, (td, _) = case.transform(), data_of(case, 3)
-        missing = transform.in_keys[-1]
-        del td[missing]
-        with pytest.raises(KeyError, match=f"{type(transform).__name__} reads .*{missing}"):
-            transform(td)
-
-
 @pytest.mark.parametrize("make", [lambda: AngleVector(["heading"], ["heading"]), lambda: MinMaxNorm(["target_field"])])
 def test_writing_over_the_state_of_the_env_is_refused(make: Callable[[], Transform]) -> None:
     transform = make()
@@ -252,7 +164,7 @@ def test_writing_over_the_state_of_the_env_is_refused(make: Callable[[], Transfo
 def test_a_reader_before_its_writer_is_refused() -> None:
     for reader in (GradientHeading(), AlignmentReward(["heading", "gradient_heading"])):
         with pytest.raises(KeyError, match=rf"{type(reader).__name__} reads '(field_gradient|gradient_heading)'"):
-            _ = TransformedEnv(nav(), Compose(reader, FieldGradient(field()), GradientHeading())).specs
+            _ = TransformedEnv(nav(), Compose(reader, FieldGradient(paper_field()), GradientHeading())).specs
 
 
 @pytest.mark.parametrize(

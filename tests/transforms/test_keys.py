@@ -1,4 +1,4 @@
-"""Keys of all transforms: other names in a foreign environment of any batch, and states that belong to one instance."""
+"""All transforms: other keys in a foreign environment of any batch, stored data, and states of one instance each."""
 
 import copy
 from collections.abc import Callable
@@ -154,6 +154,28 @@ def test_every_key_may_be_renamed_in_a_foreign_environment(kind: type[Transform]
     plain, renamed = (flight(kind, batch, key) for key in (str, other))
     assert_close(plain, renamed, rtol=0, atol=0, equal_nan=True)
     assert plain[-1] or kind is DeclareArrival
+
+
+# Data
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_stored_data_stay_as_they_are_and_a_missing_key_is_named_or_tolerated(kind: type[Transform]) -> None:
+    """A transition as of a replay buffer: a sample that is written in place would change what is stored."""
+    ins, outs = keys_of(kind)
+    foreign = Foreign((7,), ins, str, 3 if kind is DeclareArrival else 2)
+    env, transform = TransformedEnv(foreign, make(kind, ins, outs)), make(kind, ins, outs)
+    stored = env.step(env.reset().set("action", torch.zeros(7, 2)))
+    before, tensors = stored.clone(), dict(stored.items(True, True))
+    transform(stored)
+    for key, value in tensors.items():
+        assert_close(value, before[key], rtol=0, atol=0, equal_nan=True, msg=f"{key} was written in place")
+    incomplete = before.exclude(ins[-1], ("next", ins[-1]))
+    with pytest.raises(KeyError, match=rf"\w+ reads .*{ins[-1]}.*, which"):
+        transform(incomplete)
+    for part in transform if isinstance(transform, Compose) else (transform,):
+        part.set_missing_tolerance(True)
+    assert_close(transform(incomplete.clone()).to_dict(), incomplete.to_dict(), rtol=0, atol=0, equal_nan=True)
 
 
 # States

@@ -109,7 +109,6 @@ MISTAKES: dict[str, Callable[[], object]] = {
     r"no bounds for 'x': give bounds=\{'x': \(low, high\)\}": lambda: MinMaxNorm(["x"])(TensorDict(x=torch.zeros(1))),
     "no bounds for 'objective'": lambda: TransformedEnv(nav(), MinMaxNorm(["objective"], ["o"])).specs,
     r"does not scale 'y': its keys are \['x'\]": lambda: MinMaxNorm(["x"]).normalize("y", torch.zeros(1)),
-    "MinMaxNorm reads 'nope'": lambda: TransformedEnv(nav(), MinMaxNorm(["nope"], ["y"])).specs,
     r"shape \(2,\) for 'x', which has \(4, 3\)$": lambda: MinMaxNorm(["x"], bounds={"x": TWO})(
         TensorDict(x=torch.zeros(4, 3))
     ),
