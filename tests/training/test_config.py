@@ -31,7 +31,6 @@ def test_bad_settings_of_a_run(tmp_path: Path) -> None:
         ({"total_frames": 0}, "total_frames must be greater than or equal to 1, got 0"),
         ({"zeta": 3.0}, "zeta must be less than 3, got 3"),
         ({"noise": (0.05, -0.05, 5.0)}, "noise.1 must be greater than or equal to 0, got -0.05"),
-        ({"speed": 1}, "unknown key 'speed'"),
     ):
         with pytest.raises(ValueError, match=message):
             RegionConfig(**bad)
@@ -92,11 +91,9 @@ def test_other_files_are_not_resumed(tmp_path: Path) -> None:
     for content, message in (
         (None, "holds no config.json"),
         ("", "cannot resume"),
-        (f'{{{MINE}, "zeta": NaN}}', "zeta must be a finite number, got nan"),
         ("[]", "not of this version of magrl: start the training again in a new folder"),
         ('{"recipe": "ppo.py"}', r"the run was started by ppo\.py: resume it with that recipe"),
         (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
-        (f'{{{MINE}, "gamma": 2.0}}', "gamma must be less than 1, got 2.0"),
         (f'{{{MINE}, "scenario": "scenario.toml"}}', "there is no scenario file at"),
         (f'{{{MINE}, "wandb_mode": "loud"}}', "wandb_mode must be 'offline', 'online' or 'disabled'"),
     ):

@@ -49,17 +49,6 @@ def test_statistics_count_ended_episodes_only() -> None:
     assert statistics.row()["return"] == pytest.approx((-50 + 10 + 20) / 3), "the last three episodes"
 
 
-def test_statistics_continue_from_their_state() -> None:
-    one, other = TrainingStatistics(), TrainingStatistics()
-    one.add(steps([True, True], [True, False], episode_reward=[300.0, 100.0], episode_reward_alignment=[1.0, 2.0]))
-    one.updates, one.losses = 4, {"loss_actor": torch.tensor(-0.5)}
-    other.load_state_dict(one.state_dict())
-    for statistics in (one, other):
-        statistics.add(steps([True], [True], episode_reward=[20.0]))
-    assert (other.frames, other.episodes, other.iterations, other.updates) == (3, 3, 2, 4)
-    assert str(other.row()) == str(one.row())
-
-
 def test_selection_score_cannot_prefer_early_failure() -> None:
     """A failed episode counts as the step limit: leaving the map at once is worth no more than flying to the end."""
     success = torch.tensor([True, True, False])

@@ -3,6 +3,7 @@
 import csv
 import errno
 import json
+import math
 import shutil
 import signal
 from pathlib import Path
@@ -18,7 +19,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import navigation_env
 from magrl.files import locked
 from magrl.training import RegionConfig, Run, UsageError, command, curves, run
-from magrl.training.checkpoints import Checkpoints
+from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import CHANGEABLE, resumed_config
 from magrl.training.curves import TrainingStatistics
 from magrl.training.run import StopRequest
@@ -197,6 +198,21 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
     with pytest.raises(UsageError, match=r"configuration does not fit .*: zeta is 0\.5 in the run folder, 0\.01 in"):
         train(tmp_path, zeta=0.5, scenario=scenario, resume=tmp_path)
     train(tmp_path, scenario=scenario, resume=tmp_path, checkpoint_every=5.0)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_a_training_stops_at_the_first_loss_that_is_not_finite(tmp_path: Path, monkeypatch) -> None:
+    """Before it reaches a checkpoint."""
+    add = TrainingStatistics.add
+
+    def spoiled(self, batch) -> None:
+        add(self, batch)
+        self.losses = {"loss_critic": torch.tensor(math.nan if self.iterations == 3 else 1.0)}
+
+    monkeypatch.setattr(TrainingStatistics, "add", spoiled)
+    with pytest.raises(FloatingPointError, match=r"after update 0: loss_critic is not finite in rows \[0\]"):
+        train(tmp_path, checkpoint_every=0)
+    assert [read_checkpoint(path)["frames"] for path in sorted(tmp_path.glob("checkpoints/*.safetensors"))] == [2, 4]
 
 
 @pytest.mark.parametrize("fault", ["full disk", "folder removed"])

@@ -1,4 +1,4 @@
-"""Content of wandb, TensorBoard and CSV logs. An offline run is read back by record, as `wandb sync` reads it."""
+"""Content of wandb's logs. An offline run is read back by record, as `wandb sync` reads it."""
 
 from __future__ import annotations
 
