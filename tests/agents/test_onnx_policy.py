@@ -23,7 +23,6 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout
 from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
 from magrl.transforms import ReadingView, SensorErrors
-from magrl.vehicle.onboard import Onboard
 
 NOISE = (0.05, 0.05, 5.0)
 LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}
@@ -101,23 +100,6 @@ def own(tmp_path: Path) -> Path:
 def test_a_file_stands_in_tables_by_its_name(own: Path) -> None:
     episodes, alike = (evaluate(name, "paper-100", errors=NOISE, max_steps=4) for name in (str(own), load_policy(own)))
     torch.testing.assert_close(episodes["length_km"], alike["length_km"])
-
-
-def test_a_policy_flies_on_board(own: Path, tmp_path: Path) -> None:
-    """The commands of a vehicle that is stopped and resumed are the actions of the policy in the environment."""
-    env, policy = GeomagneticNavEnv(num_envs=1, seed=3), load_policy(own)
-    assert policy.in_keys == [*READINGS.keys, "elapsed_steps"]
-    state, vehicle = env.reset(), Onboard(policy, max_steps=50, radius_km=5.0)
-    vehicle.start(state["target_field"][0].tolist())
-    for step in range(5):
-        seen = *state["field"][0].tolist(), math.degrees(state["heading"].item()), state["leg"][0, 0].item()
-        command, (distance, turn) = vehicle.step(*seen), policy(state)["action"][0].tolist()
-        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
-        state = env.step(state)["next"]
-        if step == 3:
-            vehicle.save(tmp_path / "flight.pt")
-            vehicle = Onboard(load_policy(own), max_steps=50, radius_km=5.0)
-            vehicle.restore(tmp_path / "flight.pt")
 
 
 def test_a_policy_of_three_numbers_declares_its_arrival(tmp_path: Path) -> None:

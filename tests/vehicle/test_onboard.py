@@ -19,11 +19,12 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
+from support.networks import network_file
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, ObservationNorm, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from magrl.agents import FieldPolicy, PolicyConfig
+from magrl.agents import FieldPolicy, PolicyConfig, export_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.episodes import restart
 from magrl.evaluation.navigators import make_navigator
@@ -33,7 +34,7 @@ from magrl.navigators import Anywhere, Navigator, policy_env
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Rules
 from magrl.tracking.network import load_pilot, pretrained, save_pilot
-from magrl.transforms import MagneticNorth, SensorErrors
+from magrl.transforms import MagneticNorth, ReadingView, SensorErrors
 from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
@@ -165,14 +166,24 @@ def region_policy() -> FieldPolicy:
     return FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=3).observation_view(), (8,)))
 
 
-def test_commands_of_own_policies() -> None:
-    """One that reads the turn and the field of a region; its own limits and range count."""
-    base, policy = nav(), region_policy()
+@pytest.mark.parametrize("kind", ["region", "ONNX"])
+def test_commands_of_own_policies(kind: str, tmp_path: Path) -> None:
+    """Of the turn and the field of a region, or of a file of another library; their own limits count."""
+    base, view = nav(), ReadingView(max_leg_km=50.0, max_turn_rad=math.pi / 2)
+    policy = region_policy() if kind == "region" else export_policy(network_file(tmp_path, view.size), view)
     vehicle = begun(policy, base.reset()["target_field"][0].tolist(), max_leg_km=200.0)
     assert vehicle.options.max_leg_km == pytest.approx(50.0)
-    for command, state, _ in fly(base, policy, vehicle, 6):
+    for command, state, after in fly(base, policy, vehicle, 6):  # noqa: B007 - the last one is used below
         action = policy(state.clone())["action"][0].tolist()
-        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx(action, abs=1e-5)
+        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx(action, abs=1e-3)
+    again = Onboard(policy, max_leg_km=200.0)
+    vehicle.save(tmp_path / "flight.json")
+    again.restore(tmp_path / "flight.json")
+    assert again.step(*numbers(after)) == vehicle.step(*numbers(after))
+
+
+def test_a_policy_of_a_region_stays_in_its_range() -> None:
+    vehicle = Onboard(region_policy())
     with pytest.raises(ValueError, match=r"the target: D -11\.6 deg is out of the range of the navigator"):
         vehicle.start(TARGET)
     vehicle.start((9.0, -25.0, 34500.0))
