@@ -20,11 +20,6 @@ from magrl.tracking.network import correction_network, pretrained
 from magrl.transforms import SensorErrors
 
 
-@pytest.fixture
-def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=5, seed=3, start_heading="random")
-
-
 def test_an_untrained_correction_is_the_leg_of_kalman() -> None:
     base = GeomagneticNavEnv(num_envs=10, seed=0, start_heading="random")
     env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0), bias=(0.1, 0.1, 10.0), seed=0))
@@ -33,7 +28,7 @@ def test_an_untrained_correction_is_the_leg_of_kalman() -> None:
     torch.testing.assert_close(corrected, plain)
 
 
-@pytest.mark.parametrize("name", ["anywhere", "secant"])
+@pytest.mark.parametrize("name", ["anywhere", "kalman", "secant"])
 def test_every_navigator_declares(name: str) -> None:
     summary = summarize(evaluate(name, first_tasks(choose_tasks(None, "paper-100"), 3), arrival="declared"))
     assert summary["success_rate"] == 100
@@ -63,14 +58,14 @@ def test_actions_are_alike_by_any_default_type_of_floating_point_numbers() -> No
 # Files
 
 
-def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
+def test_a_pilot_flies_alike_after_saving(tmp_path: Path) -> None:
     path, network = tmp_path / "mine.safetensors", correction_network((8, 4))
     torch.nn.init.normal_(network[-1].weight)
     agent = Anywhere(Rules(step_price=2.0, range_km=500.0), network)
     magrl.save_policy(path, agent)
     loaded = magrl.load_policy(path)
     assert loaded.rules == agent.rules
-    state = policy_env(env, agent).rollout(3)[:, -1]
+    state = policy_env(GeomagneticNavEnv(num_envs=5, seed=3, start_heading="random"), agent).rollout(3)[:, -1]
     wanted, found = (one(state.clone())["action"] for one in (agent, loaded))
     assert torch.equal(found, wanted)
 

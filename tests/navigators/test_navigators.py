@@ -18,7 +18,7 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
 from magrl.guidance import displacement_to
-from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant, policy_env
+from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, Secant, policy_env
 from magrl.navigators.metaheuristics import Metaheuristic
 from magrl.navigators.quasi_newton import probe_length
 from magrl.sensor_std import STD_KEYS
@@ -37,14 +37,6 @@ NOISE = (0.05, 0.05, 5.0)
 def flown(env: GeomagneticNavEnv, navigator) -> dict[str, float]:
     env.set_seed(0)  # back to each vehicle's first task
     return summarize(episode_measures(evaluation_rollout(env, navigator)))
-
-
-def test_kalman_arrives_without_a_map() -> None:
-    """From any heading, by the standard deviations that come with the readings."""
-    base = GeomagneticNavEnv(Scenario(tasks=task_set(4, seed=93)), num_envs=4, seed=0, start_heading="random")
-    summary = flown(TransformedEnv(base, SensorErrors(NOISE)), Kalman())
-    assert summary["success_rate"] == 100
-    assert summary["spl"] > 95
 
 
 def test_a_navigator_that_is_told_of_its_arrival_searches() -> None:
@@ -83,27 +75,6 @@ def test_displacement_solves_consistent_equations() -> None:
             .isfinite()
             .all()
         )
-
-
-@pytest.mark.parametrize("turn", [math.pi / 2, 0.5])
-def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
-    """Also where the second leg is no right angle to the first; the first alone says nothing across itself."""
-    truth = torch.tensor([[0.003, -0.002], [0.001, 0.017], [-1.0, 3.0]], dtype=torch.float64)
-    start = torch.tensor([8.0, -16.0, 35000.0], dtype=torch.float64)
-    legs = torch.tensor([[0.0, 0.0], [10.0, 0.0], [10.0 * math.cos(turn), 10.0 * math.sin(turn)]], dtype=torch.float64)
-    navigator, found, memory = Secant(probe_km=10.0), [], TensorDict()
-    for step, position in enumerate(legs.cumsum(0)):
-        reading = start + truth @ position
-        seen = {"field": reading, "target_field": start + 1, "heading": torch.tensor([turn * (step == 2)])}
-        seen |= {"leg": torch.tensor([10.0 * (step > 0), 0.0]), "elapsed_steps": torch.tensor([step])}
-        acted = navigator(TensorDict({**seen, "memory": memory}).unsqueeze(0).auto_batch_size_(1))
-        memory = acted["next", "memory"][0]
-        found.append(memory["mean"][:, 1:])
-    size = torch.tensor([0.004, 0.015, 4.0], dtype=torch.float64)
-    assert (found[0] == 0).all()
-    across_only = torch.stack((truth[:, 0], torch.zeros(3, dtype=torch.float64)), -1)
-    assert ((found[1] - across_only) / size.unsqueeze(-1)).abs().max() < 0.003
-    assert ((found[2] - truth) / size.unsqueeze(-1)).abs().max() < 0.003
 
 
 @pytest.mark.parametrize(("name", "spl", "steps"), [("parallel", 99.8, 9), ("secant", 99.5, 11)])
