@@ -142,7 +142,7 @@ def test_it_goes_to_the_estimated_place_where_that_is_near(readings, monkeypatch
 
 WRONG = {"max_leg_km": 0.0, "max_turn_rad": 4.0, "max_steps": 0, "zeta": math.nan, "arrival": "guessed"}
 WRONG |= {"radius_km": -1.0, "confidence": 2.0, "range_km": math.inf, "target_std": (0.0, -1.0, 0.0), "step_price": 0.0}
-WRONG |= {"caution": -0.1, "search": True}
+WRONG |= {"caution": -0.1, "search": True, "start_km": 5.0, "target_km": 5.0}  # the last without a model
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -53,7 +53,6 @@ class Row:
 
 
 RIGHT = Row("right, IGRF-13", model="IGRF-13")
-SURVEYED = Row("right, with a survey of the destination", survey=True)
 SPIKE = Row("a spike in the first reading", spike=(0.3, 0.3, 300.0))
 BROKEN = (
     Row("start 100 km off, IGRF-14", off_km=100.0),
