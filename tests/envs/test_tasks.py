@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from geographiclib.geodesic import Geodesic
-from support.field_checks import f64
+from support.tracks import f64
 
 from magrl import paper
 from magrl.envs import PAPER_REGION, Region, Regions, Tasks, named_tasks, task_set

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from support.field_checks import f64, relative_error
+from support.tracks import f64
 from torch import Tensor
 
 from magrl.field import IGRF, FieldBank, RegionalField, SphericalHarmonicField, igrf_coefficients, random_planets
@@ -57,8 +57,8 @@ def test_a_bank_of_one_is_the_region(degree: int, error_nt: float) -> None:
     region = RegionalField(SphericalHarmonicField(earth), *box, **options)
     edges = (f64(*x).unsqueeze(0) for x in box)
     bank = FieldBank.build(earth.unsqueeze(0), torch.tensor([0]), *edges, **options)
-    place = torch.meshgrid(torch.linspace(-16.5, 6.5, 31), torch.linspace(153.5, 176.5, 29), indexing="ij")
-    index = torch.zeros(31, 29, dtype=torch.int64)
+    place = torch.meshgrid(torch.linspace(-17.5, 7.5, 26), torch.linspace(152.5, 177.5, 26), indexing="ij")
+    index = torch.zeros(26, 26, dtype=torch.int64)
     assert_same((bank(*place, index),), (region(*place),))
     assert_same(bank.value_and_gradient(*place, index), region.value_and_gradient(*place))
     assert_same((bank.coefficients[0],), (region.coefficients[: 3 * degree + 3].T,))
@@ -187,18 +187,6 @@ def igrf() -> IGRF:
 @pytest.fixture(scope="module")
 def region(igrf) -> RegionalField:
     return RegionalField(igrf, *BOX)
-
-
-def test_region_is_the_model_inside(igrf, region):
-    unit = torch.rand(2, 2000, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    unit[:, :4] = f64(0, 0, 1, 1, 0, 1, 0, 1).reshape(2, 4)  # the corners
-    position = tuple(low + (high - low) * u for (low, high), u in zip(BOX, unit, strict=True))
-    expected, expected_gradient = igrf.value_and_gradient(*position)
-    value, gradient = region.value_and_gradient(*position)
-    assert region.error_nt < 1e-5
-    assert (value - expected).abs().max() < 1e-5
-    assert torch.equal(region(*position), value)
-    assert relative_error(gradient, expected_gradient) < 1e-6
 
 
 @pytest.mark.parametrize("model", ["igrf", "region"])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from support.field_checks import f64
+from support.tracks import f64
 
 from magrl.field.elements import (
     element_difference,

@@ -13,7 +13,8 @@ import pandas
 import ppigrf
 import pytest
 import torch
-from support.field_checks import f64, globe
+from support.field_checks import globe
+from support.tracks import f64
 
 import magrl.field
 from magrl.envs import Scenario
@@ -24,8 +25,6 @@ from magrl.field.wmmhr import WMMHR_SHA256
 COEFFICIENT_FILES = {13: ppigrf.ppigrf.shc_fn_igrf13, 14: ppigrf.ppigrf.shc_fn_igrf14}
 LAST_YEAR = {13: 2025, 14: 2030}
 FIRST_INSTANT = datetime(1900, 1, 1)
-PAPER_DATE = "2022-01-01"
-ROUNDING_NT = 1e-8
 
 
 @pytest.mark.parametrize("generation", COEFFICIENT_FILES)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import scipy.special
 import torch
-from support.field_checks import central_differences, f64, globe, relative_error
+from support.field_checks import central_differences, globe, relative_error
+from support.tracks import f64
 from torch import Tensor
 
 from magrl.field import igrf_coefficients, random_planets

@@ -17,7 +17,8 @@ from magrl.geodesy import move
 
 @cache
 def paper_field() -> FieldModel:
-    return Scenario().build_field()
+    """The field of the paper's region, also where legs with errors of motion lead."""
+    return Scenario().build_field(80.0)
 
 
 def paper_env(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:

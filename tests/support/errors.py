@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import torch
+from support.environments import paper_env
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.field import FieldModel
+from magrl.envs import GeomagneticNavEnv
 from magrl.transforms import ERRORS, Conditions, MotionError, SensorErrors
 
 STD = (0.05, 0.05, 5.0)
 
 
-@cache
-def field() -> FieldModel:
-    return Scenario().build_field(80.0)
-
-
 def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0, "drift_km": 30.0} | options))
+    return paper_env(num_envs, **{"drift_km": 30.0} | options)
 
 
 def under(*errors: Transform, num_envs: int = 2) -> TransformedEnv:

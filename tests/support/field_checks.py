@@ -10,10 +10,6 @@ from torch import Tensor
 from magrl.geodesy import curvature_radii
 
 
-def f64(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
 def globe(count: int, seed: int, highest_latitude: float = 89.9) -> tuple[Tensor, Tensor]:
     """Latitude and longitude [deg] of points uniform over the globe."""
     generator = torch.Generator().manual_seed(seed)
