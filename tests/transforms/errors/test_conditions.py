@@ -27,10 +27,6 @@ from magrl.transforms import (
     CONDITIONS,
     ERRORS,
     Conditions,
-    MagneticWeather,
-    MotionError,
-    NorthReferenceError,
-    SensorErrors,
     Spikes,
     TrackField,
     VectorErrors,
@@ -45,11 +41,6 @@ NAMES = [name for name in CONDITIONS if name != "laboratory"]
 
 def nav(num_envs: int, drift_km: float = 0.0, **options: object) -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=num_envs, seed=0, start_heading="random", drift_km=drift_km, **options)
-
-
-def test_order_of_the_errors() -> None:
-    order = [MotionError, MagneticWeather, SensorErrors, NorthReferenceError]
-    assert [type(part) for part in CONDITIONS["low-cost"].transforms()] == order
 
 
 class TypicalField(nn.Module):
@@ -129,15 +120,6 @@ def test_the_variances_of_all_errors_add_up() -> None:
     torch.testing.assert_close(std.iron, torch.tensor([10.0, 10.0, 10.0], dtype=torch.float64))
 
 
-def test_evaluations_repeat_and_seeds_differ() -> None:
-    rollouts = []
-    for seed in (0, 0, 1):
-        env = with_conditions(nav(3, CONDITIONS["low-cost"].drift_km(50.0), max_steps=3), "low-cost", seed)
-        rollouts += [evaluation_rollout(env, Secant()) for _ in range(2 - seed)]
-    assert all((rollout == rollouts[0]).all() for rollout in rollouts[1:4])
-    assert not torch.equal(rollouts[0]["field"], rollouts[4]["field"])
-
-
 def test_navigators_are_told_what_they_can_tell_apart() -> None:
     env, told = nav(2), SensorStd((0.3, 0.0, 3.0), (0.4, 0.1, 4.0))
     secant = make_navigator("secant", env, sensor_std=told)
@@ -169,15 +151,6 @@ def test_agents_heed_all_errors_that_are_stated(kind: type[Kalman]) -> None:
 
 
 # Commands
-
-
-def test_evaluate_under_conditions(tmp_path: Path) -> None:
-    out = tmp_path / "results"
-    config = evaluate.Config(("secant",), tasks=5, sheet=Sheet(errors="ship"), out=out)
-    config, (flight, _), navigators, _ = evaluate.prepare(config)
-    assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
-    assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
-    assert evaluate.settings(config, flight)["errors"] == "ship"
 
 
 BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.toml"
