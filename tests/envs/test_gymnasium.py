@@ -109,17 +109,6 @@ def test_starts_without_a_map() -> None:
     assert (state["sensor_std"] > 0).any()
 
 
-def test_one_vehicle_without_a_map_reads_its_sensors_alone() -> None:
-    keys = ("field", "target_field", "leg", "heading", "sensor_std", "bias_std")
-    planets = planet_scenario(3, seed=0)
-    env = gymnasium.make(ANYWHERE_ID, scenario=planets, observation=keys, transforms=[NOISE])
-    observation, _ = env.reset(seed=0)
-    assert set(observation) == set(keys)
-    assert env.observation_space.contains(observation)
-    np.testing.assert_allclose(observation["sensor_std"], (0.05, 0.05, 5.0))
-    assert gymnasium.make(ANYWHERE_ID, scenario=planets, transforms=[]).reset(seed=0)[0].shape == (19,)
-
-
 def test_a_scenario_of_many_regions() -> None:
     planets = planet_scenario(3, seed=0)
     envs = make_vec(scenario=planets, observation="track", reward="base")

@@ -161,18 +161,13 @@ def test_json_holds_no_infinity() -> None:
     assert json_ready({"a": [math.inf, (1.5, math.nan)], "b": "nan"}) == {"a": [None, [1.5, None]], "b": "nan"}
 
 
-def test_texts_name_their_encoding_and_files_are_written_whole() -> None:
-    """The library and the recipes write by magrl.files alone, and read no text in the encoding of the locale."""
+def test_files_are_written_whole() -> None:
+    """The library and the recipes write by magrl.files alone."""
     direct = []
     for path in (file for folder in ("magrl", "recipes") for file in (ROOT / folder).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-                own = {
-                    "write_text": True,
-                    "savefig": True,
-                    "to_csv": node.args,
-                    "read_text": not (node.args or node.keywords),
-                }
+                own = {"write_text": True, "savefig": True, "to_csv": node.args}
                 direct += [f"{path}:{node.lineno}"] if own.get(node.func.attr) else []
     assert direct == []
 

@@ -2,6 +2,7 @@
 
 import json
 import random
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
 from magrl.transforms import ReadingView, load_conditions
 
+AZORES = Path(__file__).parents[2] / "docs" / "examples" / "azores.toml"
 MUTANTS = 80
 
 
@@ -53,12 +55,8 @@ def fuzz(path: Path, read: Callable[[], object], same: Callable[[object], bool],
         assert sound, f"mutant {number}: {message}"
 
 
-def small_policy() -> FieldPolicy:
-    return FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (4,)))
-
-
 def test_policies(tmp_path: Path) -> None:
-    path, policy = tmp_path / "policy.pt", small_policy()
+    path, policy = tmp_path / "policy.pt", FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (4,)))
     save_policy(path, policy)
     weights = policy.actor.state_dict()
 
@@ -99,13 +97,9 @@ def test_settings_of_runs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".toml", ".json"])
 def test_scenarios(tmp_path: Path, suffix: str) -> None:
     """A mutant may be another scenario, but then it is a valid one."""
-    path = tmp_path / f"scenario{suffix}"
-    content = {"date": "2026-07-01", "distance_range_km": [300, 500]}
-    region = {"latitude": [40, 50], "longitude": [-30, -20]}
-    lines = ["\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) for table in (content, region)]
-    path.write_text(
-        "\n[region]\n".join(lines) if suffix == ".toml" else json.dumps(content | {"region": region}), encoding="utf-8"
-    )
+    path, text = tmp_path / f"scenario{suffix}", AZORES.read_text(encoding="utf-8")
+    content = text if suffix == ".toml" else json.dumps(tomllib.loads(text), default=str)
+    path.write_text(content, encoding="utf-8")
     fuzz(path, lambda: load_scenario(path), lambda found: isinstance(found, Scenario), 3)
 
 
