@@ -263,10 +263,6 @@ UNREADABLE: dict[str, tuple[str, bytes]] = {
     "the file is not valid TOML": ("a.toml", b"[region"),
     "JSON": ("a.json", b"[" * 100_000),
     "a scenario file must hold a table, got []": ("a.json", b"[]"),
-    "unknown key 'wings': choose from max_steps, max_leg_km, max_turn_deg,": (
-        "a.json",
-        json.dumps(sound() | {"wings": 2}).encode(),
-    ),
 }
 
 

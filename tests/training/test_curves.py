@@ -27,7 +27,7 @@ def steps(done: list[bool], success: list[bool], **sums: list[float]) -> TensorD
     return TensorDict(next=TensorDict(**flags, **values), batch_size=[len(done)])
 
 
-def test_statistics_count_ended_episodes_only() -> None:
+def test_statistics_count_ended_episodes_only_and_continue_from_their_state() -> None:
     statistics = TrainingStatistics(window=3)
     assert math.isnan(statistics.row()["return"])
     sums = {
@@ -45,8 +45,12 @@ def test_statistics_count_ended_episodes_only() -> None:
     assert (row["success_rate"], row["return"], row["loss_critic"]) == (50.0, 25.0, 0.25)
     assert (row["return_destination"], row["return_proximity"]) == (100.0, -75.0)
     assert math.isnan(row["return_alignment"]), "an agent without guidance has no such term"
-    statistics.add(steps([True, True], [True, True], episode_reward=[10.0, 20.0]))
-    assert statistics.row()["return"] == pytest.approx((-50 + 10 + 20) / 3), "the last three episodes"
+    resumed = TrainingStatistics(window=3)
+    resumed.load_state_dict(statistics.state_dict())
+    for each in (statistics, resumed):
+        each.add(steps([True, True], [True, True], episode_reward=[10.0, 20.0]))
+        assert each.row()["return"] == pytest.approx((-50 + 10 + 20) / 3), "the last three episodes"
+    assert str(resumed.row()) == str(statistics.row())
 
 
 def test_selection_score_cannot_prefer_early_failure() -> None:

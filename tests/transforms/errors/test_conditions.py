@@ -185,7 +185,6 @@ def test_own_errors_in_a_file() -> None:
         ),
         ("sensors.bais = [1, 1, 1]", r"SensorErrors has no option 'bais': choose from noise, bias, .*levels, stated$"),
         ("sensors.seed = 3", r"SensorErrors has no option 'seed'"),
-        ("sensors.in_keys = ['field']", r"SensorErrors has no option 'in_keys'"),
         ("spikes.rates = 0.1", r"Spikes has no option 'rates': choose from sizes, rate, stated$"),
         ("spikes.rate = 0.1", r"mine\.toml: Spikes.*missing.*'sizes'"),
         ("motion.speed_km_h = 3", r"MotionError has no option 'speed_km_h'"),
