@@ -15,10 +15,10 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from magrl import tracking
+from magrl import pilot
 from magrl.envs import GeomagneticNavEnv
-from magrl.tracking.belief import moved, read
-from magrl.tracking.destination import destination, posterior
+from magrl.pilot.belief import moved, read
+from magrl.pilot.destination import destination, posterior
 from magrl.transforms.track import reading_of
 
 import torch
@@ -53,10 +53,10 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
     """Return the parts of a step by name; what they read is made at their first call."""
     env = GeomagneticNavEnv(num_envs=vehicles, seed=0, device=device)
     state = env.rand_action(env.reset())
-    rules = tracking.Rules(**env.limits)
+    rules = pilot.Rules(**env.limits)
     first = reading_of(state)
     after = reading_of(env.step(state)["next"])
-    track = tracking.begin(rules, first)
+    track = pilot.begin(rules, first)
     belief, std = track.state.belief, after.std.noise
     goal = destination(belief, after.target, rules.range_km)
     declared = rules.replace(arrival="declared")
@@ -65,8 +65,8 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
         "environment: start of an episode": lambda: env.reset(),
         "belief: leg and reading": lambda: read(moved(belief, after.distance, after.heading), after.field, std),
         "posterior of the destination": lambda: posterior(goal),
-        "track: belief, posterior and plan": lambda: tracking.advance(rules, track.state, after),
-        "declaration of the arrival": lambda: tracking.declaring(declared, track, after, track.plan),
+        "track: belief, posterior and plan": lambda: pilot.advance(rules, track.state, after),
+        "declaration of the arrival": lambda: pilot.declaring(declared, track, after, track.plan),
     }
 
 

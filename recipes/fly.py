@@ -29,7 +29,7 @@ from magrl.evaluation.navigators import NAMES, named
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
-from magrl.tracking.displacement import Displacement
+from magrl.pilot.displacement import Displacement
 from magrl.training import UsageError, command, parse
 
 import torch

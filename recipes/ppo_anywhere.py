@@ -23,10 +23,10 @@ from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.envs.scenario import rule_settings
-from magrl.tracking import Rules
-from magrl.tracking.destination import RANGE_KM
-from magrl.tracking.network import correction_network
-from magrl.tracking.observation import OBSERVATION_SIZE
+from magrl.pilot import Rules
+from magrl.pilot.destination import RANGE_KM
+from magrl.pilot.network import correction_network
+from magrl.pilot.observation import OBSERVATION_SIZE
 from magrl.training import Run, command, parse_config
 from magrl.training.config import (
     Count,

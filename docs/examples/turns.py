@@ -3,8 +3,8 @@
 import math
 
 from magrl.field.elements import axes_of_elements, elements_of_axes
+from magrl.pilot.belief import IRON, read, start
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import IRON, read, start
 
 import torch
 

@@ -19,9 +19,9 @@ from magrl.field import IGRF
 from magrl.field.elements import measured_elements
 from magrl.files import write_text
 from magrl.geodesy import geodesic
+from magrl.pilot.belief import Belief, before, known, moved, read
+from magrl.pilot.destination import destination, log_density, posterior
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import Belief, before, known, moved, read
-from magrl.tracking.destination import destination, log_density, posterior
 from magrl.training import command
 from magrl.vehicle.mistakes import MODEL_STD
 

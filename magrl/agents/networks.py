@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhModule, ValueOperator
 
 from magrl.checks import check_number, check_type
-from magrl.tracking import Rules
-from magrl.tracking.pilot import moving
-from magrl.tracking.planning import corrected
+from magrl.pilot import Rules
+from magrl.pilot.planning import corrected
+from magrl.pilot.step import moving
 from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM
 
 Device = torch.device | str | None
@@ -154,7 +154,7 @@ def make_actor(
 
 
 class CorrectedLeg(nn.Module):
-    """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.planning.corrected`.
+    """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.pilot.planning.corrected`.
 
     Args:
         rules: limits of the leg.
@@ -180,11 +180,11 @@ def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequent
     ``action``, scaled to [-1, 1].
 
     Args:
-        network: from ``observation`` to a correction (:func:`magrl.tracking.network.correction_network`).
+        network: from ``observation`` to a correction (:func:`magrl.pilot.network.correction_network`).
         rules: limits of the leg.
 
     Example:
-        >>> from magrl.tracking.network import correction_network
+        >>> from magrl.pilot.network import correction_network
         >>> make_correcting_actor(correction_network((32, 32)), Rules()).out_keys
         ['correction', 'action']
     """

@@ -25,8 +25,8 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.envs.scenario import rule_settings
 from magrl.files import write_atomically
 from magrl.navigators import Anywhere, Memory, Navigator
+from magrl.pilot.network import save_pilot
 from magrl.policy_files import PolicyFile, read_policy, reading
-from magrl.tracking.network import save_pilot
 from magrl.transforms import LegsView, ObservationView, ReadingView
 
 View = ObservationView | LegsView | ReadingView

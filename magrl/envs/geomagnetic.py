@@ -29,7 +29,7 @@ from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, geodesic, move, polar, wrap_angle
-from magrl.tracking.records import EpisodeRules
+from magrl.pilot.records import EpisodeRules
 from magrl.transforms.errors.base import EPISODE_STREAM, LEG_ERROR
 from magrl.transforms.views import ObservationView
 
@@ -155,7 +155,7 @@ class GeomagneticNavEnv(EnvBase):
 
     @property
     def limits(self) -> dict[str, Any]:
-        """The rules that a vehicle knows before it starts, for :class:`magrl.tracking.Rules`."""
+        """The rules that a vehicle knows before it starts, for :class:`magrl.pilot.Rules`."""
         return self.scenario.model_dump(include=set(EpisodeRules.model_fields))
 
     def observation_view(self, **observed: bool) -> ObservationView:

@@ -10,8 +10,8 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.regions import PAPER_REGION
-from magrl.tracking import Rules
-from magrl.tracking.planning import STEP_PRICE
+from magrl.pilot import Rules
+from magrl.pilot.planning import STEP_PRICE
 from magrl.transforms import (
     AlignmentReward,
     FieldGradient,

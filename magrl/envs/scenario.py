@@ -30,7 +30,7 @@ from magrl.field import (
 )
 from magrl.field.elements import elements_gradient
 from magrl.files import read_document
-from magrl.tracking.records import EpisodeRules
+from magrl.pilot.records import EpisodeRules
 
 FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""

@@ -14,7 +14,7 @@ from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
 from magrl.field.elements import measured_elements
-from magrl.tracking.records import EpisodeRules
+from magrl.pilot.records import EpisodeRules
 from magrl.transforms.errors.base import EPISODE_STREAM, LEG_ERROR
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")

@@ -17,9 +17,9 @@ from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import Navigator, policy_env
+from magrl.pilot import Rules, earth_model
+from magrl.pilot.records import Known
 from magrl.sensor_std import PERFECT, Noise, North, SensorStd
-from magrl.tracking import Rules, earth_model
-from magrl.tracking.records import Known
 from magrl.transforms import KnownPlace, TargetErrors, TrackField, with_conditions
 from magrl.transforms.errors.conditions import CONDITIONS, Conditions, conditions_named
 from magrl.transforms.errors.north import MAGNETIC
@@ -42,11 +42,11 @@ class Sheet(Known):
     """The data sheet of simulated vehicles: errors of their sensors, and what they know of them and of their trip.
 
     Options of commands and tables, files of results and the lines below tables follow from its fields: for a new one,
-    declare it here, or in :class:`~magrl.tracking.records.Known` if the pilot uses it, and use it.
+    declare it here, or in :class:`~magrl.pilot.records.Known` if the pilot uses it, and use it.
 
     Args:
         errors: also :class:`~magrl.transforms.Conditions`.
-        start_km: as in :class:`~magrl.tracking.records.Known`, with ``target_std`` and ``confidence``.
+        start_km: as in :class:`~magrl.pilot.records.Known`, with ``target_std`` and ``confidence``.
 
     Raises:
         ValueError: for unknown conditions, or a value out of its range.
@@ -92,7 +92,7 @@ class Sheet(Known):
         return errors.replace_errors(north=MAGNETIC) if self.north == MAGNETIC else errors
 
     def rules(self, scenario: Scenario, conditions: Conditions) -> dict[str, Any]:
-        """Return the values of :class:`~magrl.tracking.Rules` that vehicles know in a scenario under conditions."""
+        """Return the values of :class:`~magrl.pilot.Rules` that vehicles know in a scenario under conditions."""
         known = {name: value for name in Known.model_fields if (value := getattr(self, name)) is not None}
         if self.model is None:
             known.pop("start_km", None)
@@ -118,7 +118,7 @@ class Flight:
 
     Attributes:
         sheet: data sheet, with the north that the errors decide.
-        rules: values of :class:`~magrl.tracking.Rules` that vehicles know beside the limits of the environment.
+        rules: values of :class:`~magrl.pilot.Rules` that vehicles know beside the limits of the environment.
         base: environment without errors.
         env: environment with errors.
         sensor_std: accuracy of the sensors as the vehicles know it.

@@ -13,9 +13,9 @@ from magrl.agents.policy import TrainingSettings
 from magrl.checks import check_type, printable, short
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import NAVIGATORS, Anywhere, Memory, Navigator
+from magrl.pilot.network import pretrained
 from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.network import pretrained
 
 
 class Agent(NamedTuple):

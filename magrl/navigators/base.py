@@ -21,8 +21,8 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transf
 
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
+from magrl.pilot import Rules
 from magrl.sensor_std import PERFECT, STD_KEYS, SensorStd
-from magrl.tracking import Rules
 from magrl.transforms import DeclareArrival, TrackField
 from magrl.transforms.track import known_keys
 
@@ -130,7 +130,7 @@ class Navigator(TensorDictModuleBase):
         """Raise a ValueError where an environment is none that it was made for."""
 
     def fitted(self, env: GeomagneticNavEnv, rules: Mapping[str, Any]) -> Navigator:  # noqa: ARG002
-        """Return it for an environment, with rules of :class:`~magrl.tracking.Rules` that say what a vehicle knows."""
+        """Return it for an environment, with rules of :class:`~magrl.pilot.Rules` that say what a vehicle knows."""
         self.check_fits(env)
         return self
 
@@ -222,7 +222,7 @@ def policy_env(env: EnvBase, policy: nn.Module, **rules: Any) -> EnvBase:
     Args:
         env: navigation environment, with transforms or without.
         policy: navigator, recurrent module of TorchRL, or a module that holds them; others need nothing.
-        **rules: values of :class:`~magrl.tracking.Rules` beside the limits of the environment, such as ``confidence``.
+        **rules: values of :class:`~magrl.pilot.Rules` beside the limits of the environment, such as ``confidence``.
 
     Example:
         >>> from magrl.navigators import Secant

@@ -12,8 +12,8 @@ from torch import Tensor
 from magrl.envs import GeomagneticNavEnv
 from magrl.geodesy import geodesic, move_place, steer
 from magrl.navigators.base import Navigator
+from magrl.pilot.earth import EarthModel
 from magrl.sensor_std import SensorStd
-from magrl.tracking.earth import EarthModel
 from magrl.transforms.errors.known import PLACE_KEYS
 
 ARRIVED_KM = 0.5
@@ -32,7 +32,7 @@ class DeadReckoning(Navigator):
         max_leg_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         declares: whether the action has a third number, which declares the arrival.
-        chart: model of the Earth (:func:`magrl.tracking.earth_model`), of which it reads the declination.
+        chart: model of the Earth (:func:`magrl.pilot.earth_model`), of which it reads the declination.
 
     Example:
         >>> from magrl.navigators import policy_env

@@ -12,15 +12,15 @@ from torchrl.envs import EnvBase, Transform
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import Navigator, track_transforms
-from magrl.tracking.network import load_pilot, pretrained
-from magrl.tracking.pilot import Rules, act
+from magrl.pilot.network import load_pilot, pretrained
+from magrl.pilot.step import Rules, act
 from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, reading_of, track_of
 
 LIMITS = ("max_leg_km", "max_turn_deg")
 
 
 class Kalman(Navigator):
-    """Dual control by a belief of the field around the vehicle; see :mod:`magrl.tracking.pilot`.
+    """Dual control by a belief of the field around the vehicle; see :mod:`magrl.pilot.step`.
 
     It reads the ``track`` of a :class:`~magrl.transforms.TrackField`, which :func:`~magrl.navigators.policy_env` adds
     with its rules.
@@ -28,7 +28,7 @@ class Kalman(Navigator):
     Args:
         rules: what the vehicle knows before it starts.
         network: from an observation of the track to a correction of its plan; None to fly as planned.
-        changes: values of :class:`~magrl.tracking.Rules` that replace those.
+        changes: values of :class:`~magrl.pilot.Rules` that replace those.
 
     Source:
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
@@ -79,7 +79,7 @@ class Anywhere(Kalman):
         rules: as of :class:`Kalman`; the training's by default.
         source: file of ``save_pilot``, or a network from the observation to a correction; the
             pretrained agent by default.
-        changes: values of :class:`~magrl.tracking.Rules` that replace those.
+        changes: values of :class:`~magrl.pilot.Rules` that replace those.
 
     Raises:
         FileNotFoundError: for a missing file.

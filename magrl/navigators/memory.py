@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from magrl.checks import check_number
 from magrl.geodesy import polar, steer
 from magrl.navigators.base import Navigator
+from magrl.pilot.network import correction_network, pretrained
 from magrl.policy_files import PolicyFile, read_policy, reading
-from magrl.tracking.network import correction_network, pretrained
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE, observed_reading
 
 LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}

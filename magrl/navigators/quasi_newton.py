@@ -24,11 +24,11 @@ from magrl.field.elements import NAMES, element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.navigators.base import Navigator
+from magrl.pilot.displacement import Displacement
+from magrl.pilot.local import inverse2
+from magrl.pilot.planning import SLOPES, sensor_length
+from magrl.pilot.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.displacement import Displacement
-from magrl.tracking.local import inverse2
-from magrl.tracking.planning import SLOPES, sensor_length
-from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
 
 CURVATURE = (1.5e-6, 1.8e-6, 1.2e-3)
 """Standard deviation of the change of a gradient along the path: D, I [deg], B_H [nT], per km^2, typical of the Earth's
@@ -183,7 +183,7 @@ class QuasiNewton(Navigator):
     The filter (:func:`next_track`) weighs each reading by its noise and the length of the leg, and each
     element by how well it determines the displacement. Without noise, the first update is Broyden's. With ``search``,
     the vehicle aims at the most probable destination, given that the episode has not ended at the places where it has
-    been (:func:`~magrl.tracking.search.unvisited`).
+    been (:func:`~magrl.pilot.search.unvisited`).
 
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
@@ -192,7 +192,7 @@ class QuasiNewton(Navigator):
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
-        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.search.arrival_weights`.
+        zeta: arrival threshold on the objective, see :func:`~magrl.pilot.search.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
             it, the displacement is the estimated one.
         radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.

@@ -15,8 +15,8 @@ from magrl.field.elements import element_difference, elements_gradient, measured
 from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import geodesic, move_place, polar, to_ecef
 from magrl.guidance import displacement_to
+from magrl.pilot.displacement import displacement_between
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking.displacement import displacement_between
 from magrl.transforms.areas import turned
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.sequences import per_nanotesla

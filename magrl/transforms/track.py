@@ -14,13 +14,13 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs.utils import make_composite_from_td
 
 from magrl.checks import check_choice, check_type
+from magrl.pilot import Reading, Rules, Track, advance, begin, declaring
+from magrl.pilot.belief import LocalElements
+from magrl.pilot.displacement import DestinationPosterior, Displacement
+from magrl.pilot.observation import OBSERVATION_SIZE, TRACK_BOUNDS
+from magrl.pilot.records import State
+from magrl.pilot.step import observation
 from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.tracking import Reading, Rules, Track, advance, begin, declaring
-from magrl.tracking.belief import LocalElements
-from magrl.tracking.displacement import DestinationPosterior, Displacement
-from magrl.tracking.observation import OBSERVATION_SIZE, TRACK_BOUNDS
-from magrl.tracking.pilot import observation
-from magrl.tracking.records import State
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
 from magrl.transforms.errors.known import PLACE_KEYS
 
@@ -56,7 +56,7 @@ def track_of(record: TensorDictBase) -> Track:
 
 
 class TrackField(StatefulTransform):
-    """Keep the track of a vehicle by its own readings: the pilot of :mod:`magrl.tracking.pilot` as a transform.
+    """Keep the track of a vehicle by its own readings: the pilot of :mod:`magrl.pilot.step` as a transform.
 
     The nested key ``track`` has the state (float64, which a step reads from the TensorDict before it), the posterior of
     the displacement to the destination, its mean and covariance ``("track", "displacement", ...)`` [km], elements and
@@ -171,7 +171,7 @@ class DeclareArrival(ObservationTransform):
     """Declare arrival from the track of a :class:`TrackField` before it, so that a policy writes two numbers.
 
     For an environment whose action has a third number that declares the arrival
-    (:func:`magrl.tracking.declaring`). It also writes the probability that the vehicle is within the radius,
+    (:func:`magrl.pilot.declaring`). It also writes the probability that the vehicle is within the radius,
     ``arrival_probability`` ``(..., 1)``.
 
     Args:

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from magrl.agents import make_actor
 from magrl.agents.networks import AreaGeometry, CorrectedLeg
-from magrl.tracking import Rules
+from magrl.pilot import Rules
 from magrl.transforms import NoGoAreas
 from magrl.transforms.areas import distance_km
 

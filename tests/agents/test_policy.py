@@ -11,7 +11,7 @@ from magrl import Anywhere, GeomagneticNavEnv, ObservationView, Scenario
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.evaluation.navigators import training_settings
 from magrl.files import load_tensors, save_tensors
-from magrl.tracking.network import pretrained
+from magrl.pilot.network import pretrained
 
 CELLS = (16, 16)
 

@@ -25,7 +25,7 @@ from magrl.envs.specs import REWARD_TERMS
 from magrl.evaluation import Flight
 from magrl.field import IGRF, RegionalField
 from magrl.geodesy import move
-from magrl.tracking.network import pretrained
+from magrl.pilot.network import pretrained
 
 ANTIMERIDIAN = Region((-5.0, 5.0), (175.0, 185.0))
 

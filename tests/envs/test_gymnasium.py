@@ -25,7 +25,7 @@ from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, Geom
 from magrl.evaluation import episode_measures
 from magrl.field import elements_at
 from magrl.named_tasks import NAMED_TASKS, anywhere_env
-from magrl.tracking.observation import OBSERVATION_SIZE
+from magrl.pilot.observation import OBSERVATION_SIZE
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorErrors, TargetDifference
 
 PAPER = Scenario(field=Scenario().build_field())

@@ -16,7 +16,7 @@ from magrl.envs.navigation import navigation_env
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.navigators import Geodesic
-from magrl.tracking import Rules
+from magrl.pilot import Rules
 from magrl.transforms import DeclareArrival, GradientHeading, NorthReferenceError, SensorErrors, TrackField
 
 

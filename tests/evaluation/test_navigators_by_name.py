@@ -16,8 +16,8 @@ from magrl.evaluation.navigators import KINDS, PRETRAINED, check_distinct, make_
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import NAVIGATORS, Anywhere, policy_env
 from magrl.navigators.quasi_newton import probe_length
+from magrl.pilot.network import pretrained
 from magrl.sensor_std import SensorStd
-from magrl.tracking.network import pretrained
 from magrl.transforms import ReadingView
 
 STD, BIAS = (0.3, 0.0, 3.0), (0.4, 0.1, 4.0)

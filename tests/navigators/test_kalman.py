@@ -15,8 +15,8 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import Anywhere, Kalman, policy_env
-from magrl.tracking import Rules
-from magrl.tracking.network import correction_network, pretrained
+from magrl.pilot import Rules
+from magrl.pilot.network import correction_network, pretrained
 from magrl.transforms import SensorErrors
 
 

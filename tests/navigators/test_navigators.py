@@ -21,8 +21,8 @@ from magrl.guidance import displacement_to
 from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, Secant, policy_env
 from magrl.navigators.metaheuristics import Metaheuristic
 from magrl.navigators.quasi_newton import probe_length
+from magrl.pilot import earth_model
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import earth_model
 from magrl.transforms import Conditions, SensorErrors, with_conditions
 
 
@@ -243,7 +243,7 @@ def test_a_reading_that_is_nan_is_not_flown(env) -> None:
 
 @pytest.mark.parametrize("name", sorted({*NAVIGATORS} - {"kalman"}))  # which is in anywhere
 def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch) -> None:
-    monkeypatch.setattr(sys.modules["magrl.tracking.destination"], "_STEPS", 1)
+    monkeypatch.setattr(sys.modules["magrl.pilot.destination"], "_STEPS", 1)
     arrival = "declared" if name in ("anywhere", "dead_reckoning") else "objective"
     env = GeomagneticNavEnv(num_envs=2, seed=0, arrival=arrival)
     monkeypatch.setattr(Metaheuristic, "generations", 2)

@@ -11,7 +11,7 @@ import pytest
 
 from magrl.envs.scenario import RULES
 from magrl.evaluation import Sheet
-from magrl.tracking.records import EpisodeRules, Known
+from magrl.pilot.records import EpisodeRules, Known
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "magrl"

@@ -18,8 +18,8 @@ from magrl.agents import FieldPolicy, PolicyConfig, export_policy
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS
+from magrl.pilot import Rules
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import Rules
 from magrl.transforms import CONDITIONS, TRUE_KEYS, MagneticNorth, ReadingView, TargetErrors, TrackField
 from magrl.transforms.errors.base import EPISODE_STREAM
 

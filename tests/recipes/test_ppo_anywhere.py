@@ -16,7 +16,7 @@ from magrl.agents import make_correcting_actor
 from magrl.field import igrf_coefficients, random_planets
 from magrl.field.planets import gauss_moments
 from magrl.geodesy import geodesic
-from magrl.tracking.network import correction_network
+from magrl.pilot.network import correction_network
 from magrl.training import parse_config
 
 

@@ -17,7 +17,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.navigators import policy_env
 from magrl.navigators.memory import Memory, MemoryNetwork
-from magrl.tracking.network import pretrained
+from magrl.pilot.network import pretrained
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE
 
 CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=8)

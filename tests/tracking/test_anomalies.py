@@ -8,9 +8,9 @@ from torch import Tensor
 
 from magrl.field.elements import measured_elements
 from magrl.geodesy import geodesic
+from magrl.pilot import anomalies
+from magrl.pilot.belief import PLACE, STATES, Belief, Innovation, before, innovation, moved, updated
 from magrl.sensor_std import SensorStd
-from magrl.tracking import anomalies
-from magrl.tracking.belief import PLACE, STATES, Belief, Innovation, before, innovation, moved, updated
 
 COUNT, LEGS = 400, 8
 HERE = f64(3.0, 65.0, 18000.0)

@@ -7,13 +7,13 @@ import math
 import torch
 from support.tracks import F64, STD, f64, randn, unknown
 
+from magrl.pilot.belief import STATES, Belief, elements, innovation, moved, start
+from magrl.pilot.destination import destination, posterior
+from magrl.pilot.forecast import covariance_after
+from magrl.pilot.harmonics import turning
+from magrl.pilot.local import COEFFICIENTS
+from magrl.pilot.prior import CELLS, expected, latitude_cells
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import STATES, Belief, elements, innovation, moved, start
-from magrl.tracking.destination import destination, posterior
-from magrl.tracking.forecast import covariance_after
-from magrl.tracking.harmonics import turning
-from magrl.tracking.local import COEFFICIENTS
-from magrl.tracking.prior import CELLS, expected, latitude_cells
 
 COMPASS = SensorStd(f64(*STD), f64(math.inf, 0.0, 0.0), f64(0.0, 0.0, 0.0), f64(0.0, 0.0, 0.0))
 NOISE = f64(*STD)

@@ -9,11 +9,11 @@ import torch
 from support.tracks import F64, f64, randn
 from torch import Tensor
 
+from magrl.pilot.belief import STATES, Belief, elements, moved, start
+from magrl.pilot.decision import ArrivalDecision, Progress, approach, arrival_decision
+from magrl.pilot.destination import destination, posterior
+from magrl.pilot.displacement import DestinationPosterior
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import STATES, Belief, elements, moved, start
-from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
-from magrl.tracking.destination import destination, posterior
-from magrl.tracking.displacement import DestinationPosterior
 
 RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
 HERE = f64(0.0, 60.0, 20000.0)
@@ -32,11 +32,11 @@ def decide(
     belief = Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.place)
     target = elements(moved(belief, f64(north_km)[0], f64(0.0)[0])).value
     goal = destination(belief, target, 300.0)
-    trip = Trip(f64(path)[0], f64(400.0, 0.0), torch.tensor(left), 0.5, 50.0)
+    progress = Progress(f64(path)[0], f64(400.0, 0.0), torch.tensor(left), 0.5, 50.0)
     points = posterior(goal, 512)
     if places is not None:
         points = DestinationPosterior(places, torch.full_like(places[:, 0], 1 / len(places)))
-    decided = arrival_decision(goal, points, errors, trip, RADIUS_KM)
+    decided = arrival_decision(goal, points, errors, progress, RADIUS_KM)
     return decided, elements(belief).gradient
 
 

@@ -12,8 +12,7 @@ from torch.nn.functional import pad
 from magrl.field import IGRF, FieldBank, SphericalHarmonicField, elements_at, random_planets
 from magrl.field.elements import elements_gradient, elements_jacobian, field_vector, measured_elements
 from magrl.geodesy import geodesic, move
-from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.belief import (
+from magrl.pilot.belief import (
     ANOMALY,
     ANOMALY_KM,
     CONSTANT,
@@ -29,10 +28,11 @@ from magrl.tracking.belief import (
     read,
     start,
 )
-from magrl.tracking.destination import destination, log_density, mode, posterior
-from magrl.tracking.harmonics import generators, orders, size, turning
-from magrl.tracking.local import COEFFICIENTS
-from magrl.tracking.prior import lasting_covariances
+from magrl.pilot.destination import destination, log_density, mode, posterior
+from magrl.pilot.harmonics import generators, orders, size, turning
+from magrl.pilot.local import COEFFICIENTS
+from magrl.pilot.prior import lasting_covariances
+from magrl.sensor_std import PERFECT, SensorStd
 
 NOISE = f64(*STD)
 

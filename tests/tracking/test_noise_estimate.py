@@ -8,9 +8,9 @@ import pytest
 import torch
 from support.tracks import F64, STD, f64, randn
 
+from magrl.pilot.belief import STATES, Innovation, innovation, start, updated
+from magrl.pilot.noise import NoiseEstimate, noise_estimate
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import STATES, Innovation, innovation, start, updated
-from magrl.tracking.noise import NoiseEstimate, noise_estimate
 
 HERE, NOISE = f64(8.0, -16.0, 35000.0), f64(*STD)
 

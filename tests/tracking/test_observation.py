@@ -9,11 +9,11 @@ from support.readings import first_reading
 from support.tracks import STD, f64
 from torch import Tensor
 
+from magrl.pilot import Reading, Rules, Track, begin
+from magrl.pilot.noise import DEAD_BAND
+from magrl.pilot.observation import OBSERVATION_SIZE, track_observation
+from magrl.pilot.step import observation
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import Reading, Rules, Track, begin
-from magrl.tracking.noise import DEAD_BAND
-from magrl.tracking.observation import OBSERVATION_SIZE, track_observation
-from magrl.tracking.pilot import observation
 from magrl.transforms.track import reading_of
 
 

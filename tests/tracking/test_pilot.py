@@ -11,14 +11,14 @@ from support.tracks import STD, f64
 from tensordict import TensorDict
 from torch import Tensor
 
+from magrl.pilot import Reading, Rules, act, advance, begin, declaring, earth_model, step
+from magrl.pilot.belief import Belief, start
+from magrl.pilot.decision import ArrivalDecision
+from magrl.pilot.displacement import Displacement
+from magrl.pilot.local import COEFFICIENTS, slopes
+from magrl.pilot.records import State
+from magrl.pilot.search import VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Reading, Rules, act, advance, begin, declaring, earth_model, pilot
-from magrl.tracking.belief import Belief, start
-from magrl.tracking.decision import ArrivalDecision
-from magrl.tracking.displacement import Displacement
-from magrl.tracking.local import COEFFICIENTS, slopes
-from magrl.tracking.records import State
-from magrl.tracking.search import VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
 from magrl.transforms.track import reading_of
 
 ERRORS = SensorStd(STD, (0.5, 0.3, 60.0), (0.3, 0.2, 30.0), (20.0, 20.0, 20.0))
@@ -61,7 +61,7 @@ def test_the_first_reading_counts_with_twice_its_noise(readings) -> None:
 
 def test_the_error_of_a_leg_turns_with_its_heading() -> None:
     """10 km along and 1 km across a leg to the east, and to the northeast."""
-    found = pilot._leg_covariance(f64(10.0, 1.0).expand(2, 2), f64(math.pi / 2, math.pi / 4))
+    found = step._leg_covariance(f64(10.0, 1.0).expand(2, 2), f64(math.pi / 2, math.pi / 4))
     expected = torch.stack((f64((1.0, 0.0), (0.0, 100.0)), f64((50.5, 49.5), (49.5, 50.5))))
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
 
@@ -70,7 +70,7 @@ def test_an_unknown_displacement_carries_the_slope_of_the_field(readings) -> Non
     """The covariance of the coefficients grows by the slopes times that of the displacement."""
     belief, square = begin(RULES, readings[0]).state.belief, torch.diag(f64(9.0, 4.0))
     slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)
-    grown = (pilot.displaced(belief, square).covariance - belief.covariance)[..., :COEFFICIENTS, :COEFFICIENTS]
+    grown = (step.displaced(belief, square).covariance - belief.covariance)[..., :COEFFICIENTS, :COEFFICIENTS]
     torch.testing.assert_close(grown, slope @ square @ slope.mT, rtol=1e-6, atol=1e-6)
     assert grown.diagonal(dim1=-2, dim2=-1)[..., 0].min() > 0
 
@@ -79,7 +79,7 @@ def test_the_accuracy_of_a_reading_is_as_the_readings_show_it(readings) -> None:
     state = advance(RULES, begin(RULES, readings[0]).state, readings[1]).state
     noisier = state._replace(log_ratio=0 * state.log_ratio + math.log(4), readings=0 * state.readings + 100)
     assert (noisier.noise.factor > 1.5).all()
-    found, stated = pilot._accuracy(noisier, readings[1]).noise, readings[1].std.noise
+    found, stated = step._accuracy(noisier, readings[1]).noise, readings[1].std.noise
     torch.testing.assert_close(found, stated * noisier.noise.factor)
 
 
@@ -130,7 +130,7 @@ def test_it_goes_to_the_estimated_place_where_that_is_near(readings, monkeypatch
     near = f64((0.0, 20.0), (0.0, 30.0), (0.0, -10.0), (0.0, 0.0))
     sure, worth = f64(0.1, 0.1, 0.1, 0.7), f64(0.5, 0.5, 0.5, 0.5)
     decision = ArrivalDecision(sure, worth, sure, near, torch.full((4,), 12.0))
-    monkeypatch.setattr(pilot, "arrival_decision", lambda *_: decision)
+    monkeypatch.setattr(step, "arrival_decision", lambda *_: decision)
     seen = readings[0]._replace(heading=f64(0.0, 0.0, 0.0, 0.0))
     action = f64((50.0, -1.0)).expand(4, 2)
     sent, quarter = declaring(RULES, begin(RULES, seen), seen, action)[0], math.pi / 2

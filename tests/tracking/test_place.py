@@ -14,14 +14,14 @@ from magrl.envs import Scenario, earth_scenario
 from magrl.field import IGRF
 from magrl.field.elements import elements_jacobian, measured_elements
 from magrl.geodesy import geodesic, move, move_place
+from magrl.pilot import earth, earth_model
+from magrl.pilot.belief import DRIFT, PLACE, Belief, Motion, at_place, before, moved, read, start
+from magrl.pilot.destination import destination, posterior
+from magrl.pilot.earth import EarthModel, secular_variance
+from magrl.pilot.local import slopes
+from magrl.pilot.prior import lasting_covariances
+from magrl.pilot.survey import surveyed
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import earth, earth_model
-from magrl.tracking.belief import DRIFT, PLACE, Belief, Motion, at_place, before, moved, read, start
-from magrl.tracking.destination import destination, posterior
-from magrl.tracking.earth import EarthModel, secular_variance
-from magrl.tracking.local import slopes
-from magrl.tracking.prior import lasting_covariances
-from magrl.tracking.survey import surveyed
 from magrl.transforms import CONDITIONS
 
 PLACES = torch.tensor([[50.0, 10.0], [-20.0, 150.0], [70.0, -120.0], [5.0, 179.9]], dtype=torch.float64)

@@ -12,14 +12,14 @@ from torch.autograd.functional import jacobian
 
 from magrl.field.elements import elements_jacobian
 from magrl.geodesy import geodesic, move
+from magrl.pilot import planning
+from magrl.pilot.belief import ANOMALY, CONSTANT, Belief, elements, moved, read, start
+from magrl.pilot.destination import Destination, destination, mode, posterior
+from magrl.pilot.displacement import DestinationPosterior
+from magrl.pilot.forecast import covariance_after
+from magrl.pilot.planning import planned_leg, step_price
+from magrl.pilot.prior import DEGREE, closure
 from magrl.sensor_std import SensorStd
-from magrl.tracking import planning
-from magrl.tracking.belief import ANOMALY, CONSTANT, Belief, elements, moved, read, start
-from magrl.tracking.destination import Destination, destination, mode, posterior
-from magrl.tracking.displacement import DestinationPosterior
-from magrl.tracking.forecast import covariance_after
-from magrl.tracking.planning import planned_leg, step_price
-from magrl.tracking.prior import DEGREE, closure
 
 RANGE_KM, KM = 300.0, f64(40.0)[0]
 HERE = f64(8.0, -16.0, 35000.0)

@@ -16,8 +16,8 @@ from torchrl.envs import Compose, EnvBase, PendulumEnv, SerialEnv, Transform, Tr
 from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import GeomagneticNavEnv
+from magrl.pilot import Rules
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import Rules
 from magrl.transforms import (
     AlignmentReward,
     AngleVector,

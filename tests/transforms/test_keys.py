@@ -17,7 +17,7 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from magrl import Scenario, transforms
-from magrl.tracking import Rules
+from magrl.pilot import Rules
 from magrl.transforms import AngleVector, DeclareArrival, EpisodeSum, MinMaxNorm, TrackField
 from magrl.transforms.base import StatefulTransform
 from magrl.transforms.track import READ_KEYS

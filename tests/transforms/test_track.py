@@ -19,8 +19,8 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
 from magrl.navigators import Secant, policy_env
-from magrl.tracking import Rules, Track, advance, begin, declaring
-from magrl.tracking.pilot import observation
+from magrl.pilot import Rules, Track, advance, begin, declaring
+from magrl.pilot.step import observation
 from magrl.transforms import DeclareArrival, KnownPlace, SensorErrors, TrackField
 from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, known_keys, reading_of, track_of
 

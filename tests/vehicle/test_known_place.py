@@ -13,10 +13,10 @@ from support.tracks import f64
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place, polar
+from magrl.pilot import advance, earth_model
+from magrl.pilot.belief import PLACE, Motion, at_place, settled, updated
+from magrl.pilot.step import position_fix
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.tracking import advance, earth_model
-from magrl.tracking.belief import PLACE, Motion, at_place, settled, updated
-from magrl.tracking.pilot import position_fix
 from magrl.vehicle.onboard import Command, Onboard
 from magrl.vehicle.onboard.doubt import Doubt
 

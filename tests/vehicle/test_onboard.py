@@ -31,9 +31,9 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move, move_place
 from magrl.navigators import Anywhere, Navigator, policy_env
+from magrl.pilot import Rules
+from magrl.pilot.network import load_pilot, pretrained, save_pilot
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Rules
-from magrl.tracking.network import load_pilot, pretrained, save_pilot
 from magrl.transforms import MagneticNorth, ReadingView, SensorErrors
 from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 

@@ -9,16 +9,16 @@ from typing import NamedTuple
 import torch
 
 from magrl.field.elements import NAMES
-from magrl.tracking import Track
-from magrl.tracking.anomalies import joint_tail
-from magrl.tracking.belief import elements
-from magrl.tracking.records import State
+from magrl.pilot import Track
+from magrl.pilot.anomalies import joint_tail
+from magrl.pilot.belief import elements
+from magrl.pilot.records import State
 from magrl.vehicle.onboard.journal import Step
 
 LEAST_FIT = 0.01
 """Fit of the readings (:class:`Command`) below which a vehicle does not say that it has arrived."""
 LOST_SURPRISE = 20.0
-"""Mean of the last surprises (:class:`~magrl.tracking.Track`) beyond which the readings contradict each other. With the
+"""Mean of the last surprises (:class:`~magrl.pilot.Track`) beyond which the readings contradict each other. With the
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
 _LAST, _LEAST = 8, 2
 HANGS = 20.0

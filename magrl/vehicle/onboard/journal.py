@@ -16,11 +16,11 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
+from magrl.pilot import Rules
+from magrl.pilot.belief import CONSTANT, DRIFT, PLACE
+from magrl.pilot.displacement import Displacement
+from magrl.pilot.records import FARTHEST_START_KM, State
 from magrl.sensor_std import OUTAGE_STD, PERFECT, North, SensorStd
-from magrl.tracking import Rules
-from magrl.tracking.belief import CONSTANT, DRIFT, PLACE
-from magrl.tracking.displacement import Displacement
-from magrl.tracking.records import FARTHEST_START_KM, State
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
@@ -69,7 +69,7 @@ def _accuracy(value: Any) -> SensorStd:
 
 
 class Options(Inputs, Rules):
-    """Hold the options of :class:`~magrl.vehicle.onboard.Onboard`: all :class:`~magrl.tracking.Rules`, and the sensors.
+    """Hold the options of :class:`~magrl.vehicle.onboard.Onboard`: all :class:`~magrl.pilot.Rules`, and the sensors.
 
     Args:
         arrival: always declared: nothing tells a vehicle that it has arrived.
@@ -221,7 +221,7 @@ class Command:
         sensor_errors: estimated constant errors of D [deg], I [deg], B_H [nT], to be subtracted from readings.
         sensor_errors_std: their standard deviations.
         anomaly_weights: probabilities that anomalies here are as large as each of
-            :data:`~magrl.tracking.anomalies.SIZES_NT`.
+            :data:`~magrl.pilot.anomalies.SIZES_NT`.
         fit: probability that readings as surprising as the first and the last ones occur if everything stated is true;
             below :data:`~magrl.vehicle.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
 

@@ -12,14 +12,14 @@ from torch import Tensor
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import field_vector
 from magrl.field.igrf import parse_date
+from magrl.pilot import Reading, Rules, earth_model
+from magrl.pilot.anomalies import recentered, reweighed
+from magrl.pilot.belief import updated
+from magrl.pilot.earth import NEWEST, EarthModel
+from magrl.pilot.planning import SLOPES
+from magrl.pilot.records import State
+from magrl.pilot.step import position_fix
 from magrl.sensor_std import SensorStd
-from magrl.tracking import Reading, Rules, earth_model
-from magrl.tracking.anomalies import recentered, reweighed
-from magrl.tracking.belief import updated
-from magrl.tracking.earth import NEWEST, EarthModel
-from magrl.tracking.pilot import position_fix
-from magrl.tracking.planning import SLOPES
-from magrl.tracking.records import State
 from magrl.vehicle.mistakes import deviation, likely_mistake, model_std
 from magrl.vehicle.onboard.journal import Fix, Journal, Triple
 from magrl.vehicle.onboard.limits import check_earth_reading

@@ -17,7 +17,7 @@ from typing import Any
 
 from magrl.checks import check_number
 from magrl.field.elements import FIELD_NT, NAMES, UNITS
-from magrl.tracking.planning import MISSING_KM, SLOPES
+from magrl.pilot.planning import MISSING_KM, SLOPES
 
 TOTAL_NT = (20000.0, 76000.0)
 """Least and greatest total intensity: 10 % beyond IGRF [nT]."""

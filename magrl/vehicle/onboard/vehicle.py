@@ -1,7 +1,7 @@
 """Navigation on board one vehicle: plain numbers in, a command out, without an environment.
 
 Angles are in degrees, clockwise from the vehicle's north, true or magnetic, distances in kilometers, and intensities in
-nanotesla. The step is :mod:`magrl.tracking.pilot`.
+nanotesla. The step is :mod:`magrl.pilot.step`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from torch import Tensor, nn
 
 from magrl.checks import check_type
 from magrl.files import write_atomically
+from magrl.pilot import Reading, Rules, Track, act, advance, begin, declaring, retargeted
+from magrl.pilot.belief import PLACE
+from magrl.pilot.decision import ArrivalDecision
+from magrl.pilot.earth import NEWEST
+from magrl.pilot.network import pilot_of
+from magrl.pilot.records import State
 from magrl.sensor_std import OUTAGE_STD
-from magrl.tracking import Reading, Rules, Track, act, advance, begin, declaring, retargeted
-from magrl.tracking.belief import PLACE
-from magrl.tracking.decision import ArrivalDecision
-from magrl.tracking.earth import NEWEST
-from magrl.tracking.network import pilot_of
-from magrl.tracking.records import State
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.vehicle.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
@@ -37,7 +37,7 @@ USUAL: dict[str, Any] = {
     "drift": 0.03,  # of a log to 3 %, and a current of as much
     "wander_km": 0.1,
 }
-"""Rules of a vehicle, which replace the defaults of :class:`~magrl.tracking.Rules` and the training's."""
+"""Rules of a vehicle, which replace the defaults of :class:`~magrl.pilot.Rules` and the training's."""
 LONGEST_DISPLACEMENT_KM = 2500.0
 """Estimated distance beyond which an agent without a map is out of range: there its observation saturates."""
 HIGHEST_LATITUDE = 85.0
@@ -58,7 +58,7 @@ class Onboard:
 
     Args:
         navigator: ``"anywhere"`` for the pretrained agent, ``"kalman"``, or a file of
-            :func:`~magrl.tracking.network.save_pilot`, which run without TorchRL; ``"secant"``, a file of
+            :func:`~magrl.pilot.network.save_pilot`, which run without TorchRL; ``"secant"``, a file of
             :func:`magrl.save_policy`, a policy or a navigator, of which the vehicle gets a copy.
         options: of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are from the
             training, but :data:`USUAL`. The limits of a leg are at most the training's limits.
@@ -133,7 +133,7 @@ class Onboard:
                 by default for elements without a place.
             start_std: standard deviations of the elements at the start, 0 by default.
             date: date of the flight, such as ``"2026-06-30"``.
-            model: model of the Earth that the vehicle carries (:func:`magrl.tracking.earth_model`); None for none.
+            model: model of the Earth that the vehicle carries (:func:`magrl.pilot.earth_model`); None for none.
             start_km: root mean square error of the place of the start [km].
             target_km: the same of the destination.
             altitude_km: altitude of the flight, for the model [km].

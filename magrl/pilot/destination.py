@@ -1,7 +1,7 @@
 """Where the destination is, given its elements: the posterior of the displacement as weighted points.
 
 At a displacement d along a great circle, the field is linear in the coefficients of a belief, H(d) c
-(:func:`~magrl.tracking.harmonics.field_rows`, with the higher degrees as their regression). It is given in axes that
+(:func:`~magrl.pilot.harmonics.field_rows`, with the higher degrees as their regression). It is given in axes that
 are carried along the great circle; north there differs from theirs by the angle gamma(d) of the meridians, by which the
 vector of the destination's elements is turned back, and the vertical on the ellipsoid by a small angle more. The
 posterior's density is the density of the vector, under the normal distribution of the predicted field, times a normal
@@ -19,13 +19,13 @@ import torch
 from torch import Tensor
 
 from magrl.field.elements import field_vector
+from magrl.pilot.anomalies import crust_correlation, crust_share
+from magrl.pilot.belief import ANOMALY, MODEL_NT, PLACE, Belief
+from magrl.pilot.displacement import DestinationPosterior, Displacement, displacement_between
+from magrl.pilot.harmonics import UNIT_KM, constant, powers, turning
+from magrl.pilot.local import COEFFICIENTS, cholesky2, levers, monomial_rows, unturned
+from magrl.pilot.prior import DEGREE, HIGHEST, closure
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.anomalies import crust_correlation, crust_share
-from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief
-from magrl.tracking.displacement import DestinationPosterior, Displacement, displacement_between
-from magrl.tracking.harmonics import UNIT_KM, constant, powers, turning
-from magrl.tracking.local import COEFFICIENTS, cholesky2, levers, monomial_rows, unturned
-from magrl.tracking.prior import DEGREE, HIGHEST, closure
 
 RANGE_KM = 400.0
 """Default of the prior standard deviation of the displacement along each axis [km]."""
@@ -95,11 +95,11 @@ def destination(
         errors: accuracy of the readings, tensors ``(..., 3)``.
         std: ``(3,)`` standard deviations of the elements; 0 by default.
         place: ``(..., 2)`` latitude, longitude [deg] of the destination, where that is known and the vehicle knows its
-            own; the elements count before (:func:`~magrl.tracking.survey.surveyed`).
+            own; the elements count before (:func:`~magrl.pilot.survey.surveyed`).
         place_km: its root mean square error [km].
 
     Example:
-        >>> from magrl.tracking.belief import start
+        >>> from magrl.pilot.belief import start
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd())
         >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
         tensor(4., dtype=torch.float64)
@@ -134,7 +134,7 @@ def log_density(goal: Destination, points: Tensor) -> Tensor:
 
     Example:
         >>> from magrl.sensor_std import SensorStd
-        >>> from magrl.tracking.belief import start
+        >>> from magrl.pilot.belief import start
         >>> there = destination(start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd()), torch.zeros(3), 300.0)
         >>> log_density(there, torch.zeros(5, 2)).shape
         torch.Size([5])
@@ -151,7 +151,7 @@ def mode(goal: Destination) -> Displacement:
 
     Example:
         >>> from magrl.sensor_std import SensorStd
-        >>> from magrl.tracking.belief import start
+        >>> from magrl.pilot.belief import start
         >>> here = torch.tensor([3.0, 65.0, 18000.0])
         >>> mode(destination(start(here, SensorStd()), here, 300.0)).mean.round().abs()
         tensor([0., 0.], dtype=torch.float64)
@@ -196,7 +196,7 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
 
     Example:
         >>> from magrl.sensor_std import SensorStd
-        >>> from magrl.tracking.belief import start
+        >>> from magrl.pilot.belief import start
         >>> belief = start(torch.tensor([0.0, 60.0, 20000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
         >>> there = destination(belief, torch.tensor([0.0, 61.0, 19000.0]), 300.0)
         >>> posterior(there).displacement().mean.round(decimals=-1)

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from magrl.field.elements import element_difference, elements_jacobian, measured_elements
+from magrl.pilot.anomalies import crust_correlation, crust_share
+from magrl.pilot.belief import ANOMALY, MODEL_NT, PLACE, Belief, Innovation, settled, updated
+from magrl.pilot.displacement import displacement_between
+from magrl.pilot.earth import EarthModel
+from magrl.pilot.harmonics import UNIT_KM
+from magrl.pilot.local import COEFFICIENTS, levers, slopes, unturned
+from magrl.pilot.prior import DEGREE, closure
 from magrl.sensor_std import SensorStd
-from magrl.tracking.anomalies import crust_correlation, crust_share
-from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief, Innovation, settled, updated
-from magrl.tracking.displacement import displacement_between
-from magrl.tracking.earth import EarthModel
-from magrl.tracking.harmonics import UNIT_KM
-from magrl.tracking.local import COEFFICIENTS, levers, slopes, unturned
-from magrl.tracking.prior import DEGREE, closure
 
 THERE_NT, THERE_PRIOR = (0.0, 30.0, 100.0, 300.0), (0.6, 0.25, 0.1, 0.05)
 """Sizes of an anomaly at the destination alone [nT in each axis], and their probabilities; chosen."""

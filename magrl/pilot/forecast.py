@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from magrl.field.elements import elements_jacobian
+from magrl.pilot.belief import ANOMALY_KM, DRIFT, MODEL_NT, PLACE
+from magrl.pilot.destination import _DIFFERENCE_KM, _ENTRIES, Destination, _carried, _inverse, _with_latitude
+from magrl.pilot.displacement import Displacement
+from magrl.pilot.harmonics import UNIT_KM, powers, turning
+from magrl.pilot.local import COEFFICIENTS, TERMS, inverse2, inverse3, levers, monomial_rows, slopes, unturned
+from magrl.pilot.prior import DEGREE, closure, lasting_covariances
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import ANOMALY_KM, DRIFT, MODEL_NT, PLACE
-from magrl.tracking.destination import _DIFFERENCE_KM, _ENTRIES, Destination, _carried, _inverse, _with_latitude
-from magrl.tracking.displacement import Displacement
-from magrl.tracking.harmonics import UNIT_KM, powers, turning
-from magrl.tracking.local import COEFFICIENTS, TERMS, inverse2, inverse3, levers, monomial_rows, slopes, unturned
-from magrl.tracking.prior import DEGREE, closure, lasting_covariances
 
 
 def covariance_after(
@@ -35,8 +35,8 @@ def covariance_after(
         readings: number of readings at each place, whose noise is averaged: a number or ``(M,)``.
 
     Example:
-        >>> from magrl.tracking.belief import start
-        >>> from magrl.tracking.destination import destination
+        >>> from magrl.pilot.belief import start
+        >>> from magrl.pilot.destination import destination
         >>> here, errors = torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0]))
         >>> goal = destination(start(here, errors), torch.tensor([3.0, 66.0, 17500.0]), 300.0)
         >>> legs = torch.tensor([[50.0, 0.0], [0.0, 50.0]])

@@ -14,9 +14,9 @@ from magrl.field.igrf import Date, igrf_coefficients, parse_date
 from magrl.field.model import FieldModel
 from magrl.field.planets import gauss_moments
 from magrl.geodesy import move_place
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, constant, turning
-from magrl.tracking.local import COEFFICIENTS, carried_back, levers, slopes
-from magrl.tracking.prior import DEGREE, Cells, cells, local_covariance
+from magrl.pilot.harmonics import RADIUS, UNIT_KM, constant, turning
+from magrl.pilot.local import COEFFICIENTS, carried_back, levers, slopes
+from magrl.pilot.prior import DEGREE, Cells, cells, local_covariance
 
 RINGS_KM = (80.0, 200.0, 350.0, 500.0)
 """Distances of the places to which local coefficients are fitted [km]; 12 in each ring, and the place itself."""

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from magrl import guidance
-from magrl.tracking.displacement import Displacement
-from magrl.tracking.local import cholesky2
+from magrl.pilot.displacement import Displacement
+from magrl.pilot.local import cholesky2
 
 VISITED = 24
 """Number of past places that a search remembers."""

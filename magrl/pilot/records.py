@@ -9,14 +9,14 @@ from pydantic import ConfigDict, Field, model_validator
 from torch import Tensor
 
 from magrl.checks import CheckedModel
+from magrl.pilot import anomalies
+from magrl.pilot.belief import Belief, LocalElements, Motion
+from magrl.pilot.destination import RANGE_KM, Destination
+from magrl.pilot.displacement import DestinationPosterior, Displacement
+from magrl.pilot.earth import EarthModel
+from magrl.pilot.noise import NoiseEstimate
+from magrl.pilot.planning import CAUTION, STEP_PRICE
 from magrl.sensor_std import SensorStd
-from magrl.tracking import anomalies
-from magrl.tracking.belief import Belief, LocalElements, Motion
-from magrl.tracking.destination import RANGE_KM, Destination
-from magrl.tracking.displacement import DestinationPosterior, Displacement
-from magrl.tracking.earth import EarthModel
-from magrl.tracking.noise import NoiseEstimate
-from magrl.tracking.planning import CAUTION, STEP_PRICE
 
 FARTHEST_START_KM = 100.0
 """Largest error of a known place or a leg [km]: over longer distances, the field is not linear in the place."""
@@ -101,7 +101,7 @@ class Rules(Known, EpisodeRules):
         range_km: prior standard deviation of the displacement to the destination along each axis [km].
         step_price: price of a step [% of SPL]: a higher one gives fewer steps and a longer path.
         caution: weight of the uncertainty in the plan.
-        model: model of the Earth that the vehicle carries (:func:`~magrl.tracking.earth_model`); None for no other
+        model: model of the Earth that the vehicle carries (:func:`~magrl.pilot.earth_model`); None for no other
             knowledge than the spectrum of the Earth's field.
         target_km: root mean square error of the place of the destination [km]; None where it knows the elements alone.
         drift: constant drift of dead reckoning along each axis [share of the distance].
@@ -179,7 +179,7 @@ class Reading(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a step needs of the one before, all tensors: the beliefs side by side (:mod:`~magrl.tracking.anomalies`)
+    """What a step needs of the one before, all tensors: the beliefs side by side (:mod:`~magrl.pilot.anomalies`)
     ``(..., H, S)``, ``(..., H, S, S)``, their place ``(..., 2)`` and the logarithms of their weights ``(..., H)``;
     their noise estimates ``(..., H, 3)`` twice; displacements to visited places ``(..., 24, 2)`` [km]; weights of the
     objective ``(..., 3)``; the path flown ``(...)`` and the displacement from the start ``(..., 2)`` [km]; and the

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from magrl.pilot.destination import Destination
+from magrl.pilot.displacement import DestinationPosterior
+from magrl.pilot.forecast import covariance_after
 from magrl.sensor_std import SensorStd
-from magrl.tracking.destination import Destination
-from magrl.tracking.displacement import DestinationPosterior
-from magrl.tracking.forecast import covariance_after
 
 CAUTION = 0.3
 """Weight of the uncertainty after a reading; this and :data:`LENGTHS` are from scans on random planets."""
@@ -115,7 +115,7 @@ def planned_leg(
 
     - the path: the length of the leg plus the mean distance that then remains, over the posterior of the displacement;
     - the detour that the uncertainty of the displacement may then cost, times ``caution``: what a reading at the end of
-      the leg will teach does not depend on what will be read (:func:`~magrl.tracking.forecast.covariance_after`);
+      the leg will teach does not depend on what will be read (:func:`~magrl.pilot.forecast.covariance_after`);
     - the price of the steps that remain.
 
     Args:
@@ -131,8 +131,8 @@ def planned_leg(
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
 
     Example:
-        >>> from magrl.tracking.belief import start
-        >>> from magrl.tracking.destination import destination, posterior
+        >>> from magrl.pilot.belief import start
+        >>> from magrl.pilot.destination import destination, posterior
         >>> here, errors = torch.tensor([8.0, -16.0, 35000.0]), SensorStd(torch.tensor([0.02, 0.02, 2.0]))
         >>> goal = destination(start(here, errors), torch.tensor([9.0, -20.0, 34500.0]), range_km=300.0)
         >>> there = posterior(goal)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from magrl.geodesy import wrap_angle
+from magrl.pilot.destination import Destination, unit_points
+from magrl.pilot.displacement import DestinationPosterior
+from magrl.pilot.forecast import covariance_after
+from magrl.pilot.local import cholesky2
 from magrl.sensor_std import SensorStd
-from magrl.tracking.destination import Destination, unit_points
-from magrl.tracking.displacement import DestinationPosterior
-from magrl.tracking.forecast import covariance_after
-from magrl.tracking.local import cholesky2
 
 # Chosen on random planets.
 STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
@@ -27,7 +27,7 @@ READINGS = (1, 2, 4, 8, 16, 32)
 _NONE = 0.01  # readings, for a forecast without one
 
 
-class Trip(NamedTuple):
+class Progress(NamedTuple):
     """What a decision knows of the path, its steps and their price.
 
     Attributes:
@@ -68,7 +68,7 @@ class ArrivalDecision(NamedTuple):
 
 
 def arrival_decision(
-    goal: Destination, posterior: DestinationPosterior, errors: SensorStd, trip: Trip, radius_km: float
+    goal: Destination, posterior: DestinationPosterior, errors: SensorStd, progress: Progress, radius_km: float
 ) -> ArrivalDecision:
     """Return whether to declare that the destination is within a radius, or where to stop and read on.
 
@@ -83,16 +83,16 @@ def arrival_decision(
         goal: the destination as seen from the belief.
         posterior: its posterior.
         errors: accuracy of the readings, tensors ``(..., 3)``.
-        trip: path, steps and their price.
+        progress: path, steps and their price.
         radius_km: distance from the destination within which a declaration is right [km].
 
     Example:
-        >>> from magrl.tracking.belief import start
-        >>> from magrl.tracking.destination import destination, posterior
+        >>> from magrl.pilot.belief import start
+        >>> from magrl.pilot.destination import destination, posterior
         >>> here, errors = torch.tensor([8.0, -16.0, 35000.0]), SensorStd(torch.tensor([0.02, 0.02, 2.0]))
         >>> goal = destination(start(here, errors), here, range_km=300.0)
-        >>> trip = Trip(torch.tensor(400.0), torch.tensor([400.0, 0.0]), torch.tensor(9), 0.5, 50.0)
-        >>> arrival_decision(goal, posterior(goal), errors, trip, radius_km=25.0).probability > 0.8
+        >>> progress = Progress(torch.tensor(400.0), torch.tensor([400.0, 0.0]), torch.tensor(9), 0.5, 50.0)
+        >>> arrival_decision(goal, posterior(goal), errors, progress, radius_km=25.0).probability > 0.8
         tensor(True)
     """
     probability, displacement = posterior.within(radius_km), posterior.aim(radius_km).to(goal.field)
@@ -106,24 +106,24 @@ def arrival_decision(
     later = _within(covariance[..., 1:, :, :], apart.float(), radius_km).to(displacement)  # (..., K, J)
     tails = (1 + (probability / now.clamp_min(1e-6)).clamp_max(1)) / 2
     later = later * torch.where(distance[..., 0] < radius_km, tails, 1.0)[..., None, None]
-    possible = (readings <= trip.steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
+    possible = (readings <= progress.steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
     later = later.where(possible, 0.0)
-    worth, best = (later * _efficiency(trip, displacement, distance - stops, readings)).flatten(-2).max(-1)
+    worth, best = (later * _efficiency(progress, displacement, distance - stops, readings)).flatten(-2).max(-1)
     attainable = torch.maximum(probability, later.flatten(-2).amax(-1))
     error = covariance[..., 0, :, :].diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().to(displacement)
     stop_km = torch.maximum(stops[best % len(STOPS)], (error / 2).clamp_max(SHORT * radius_km))
     return ArrivalDecision(probability, worth, attainable, displacement, stop_km)
 
 
-def _efficiency(trip: Trip, displacement: Tensor, further: Tensor, readings: Tensor) -> Tensor:
+def _efficiency(progress: Progress, displacement: Tensor, further: Tensor, readings: Tensor) -> Tensor:
     """Return the SPL of an arrival after a further path ``(..., J)`` [km] and readings ``(K,)``, less the price of the
     steps, over the SPL of an arrival now: ``(..., K, J)``."""
-    straight = (trip.home.to(displacement) + displacement).norm(dim=-1).clamp_min(1.0)
-    flown = trip.path.to(displacement)
+    straight = (progress.home.to(displacement) + displacement).norm(dim=-1).clamp_min(1.0)
+    flown = progress.path.to(displacement)
     path = torch.maximum(flown, straight)
     share = path.unsqueeze(-1) / torch.maximum(flown.unsqueeze(-1) + further, straight.unsqueeze(-1))
-    steps = readings.unsqueeze(-1) + (further / trip.max_leg_km).unsqueeze(-2)
-    price = torch.as_tensor(trip.price).to(displacement) / 100 * (path / straight)
+    steps = readings.unsqueeze(-1) + (further / progress.max_leg_km).unsqueeze(-2)
+    price = torch.as_tensor(progress.price).to(displacement) / 100 * (path / straight)
     return share.unsqueeze(-2) - price[..., None, None] * steps
 
 

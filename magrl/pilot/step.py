@@ -27,9 +27,8 @@ from torch.nn.functional import pad
 
 from magrl.field.elements import element_difference
 from magrl.geodesy import steer
-from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.tracking import anomalies
-from magrl.tracking.belief import (
+from magrl.pilot import anomalies
+from magrl.pilot.belief import (
     PLACE,
     STATES,
     Belief,
@@ -42,17 +41,18 @@ from magrl.tracking.belief import (
     predicted,
     updated,
 )
-from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
-from magrl.tracking.destination import Destination, destination, posterior
-from magrl.tracking.displacement import Displacement, displacement_between
-from magrl.tracking.earth import EarthModel
-from magrl.tracking.local import COEFFICIENTS, slopes
-from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
-from magrl.tracking.observation import track_observation, turned
-from magrl.tracking.planning import corrected, planned_leg, step_price
-from magrl.tracking.records import Reading, Rules, State, Track
-from magrl.tracking.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
-from magrl.tracking.survey import anomaly_there, surveyed
+from magrl.pilot.decision import ArrivalDecision, Progress, approach, arrival_decision
+from magrl.pilot.destination import Destination, destination, posterior
+from magrl.pilot.displacement import Displacement, displacement_between
+from magrl.pilot.earth import EarthModel
+from magrl.pilot.local import COEFFICIENTS, slopes
+from magrl.pilot.noise import NoiseEstimate, noise_estimate, spike_factor
+from magrl.pilot.observation import track_observation, turned
+from magrl.pilot.planning import corrected, planned_leg, step_price
+from magrl.pilot.records import Reading, Rules, State, Track
+from magrl.pilot.search import arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
+from magrl.pilot.survey import anomaly_there, surveyed
+from magrl.sensor_std import OUTAGE_STD, SensorStd
 
 PRICE_KM = 300.0
 """Displacement that counts as 100 % in the price of a step [km]."""
@@ -78,7 +78,7 @@ def advance(rules: Rules, state: State, reading: Reading) -> Track:
     """Return the track after a leg and the reading at its end.
 
     The stated noise is always scaled by what the readings show (``noise_estimate``), and a spike
-    counts less (:func:`~magrl.tracking.spike_factor`).
+    counts less (:func:`~magrl.pilot.spike_factor`).
     """
     return _estimated(rules, reading, *_advanced(rules, state, reading))
 
@@ -273,7 +273,7 @@ def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, t
 
 def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:
     """Return what a network observes of a track ``(..., 19)``, relative to the heading
-    (:func:`~magrl.tracking.observation.track_observation`)."""
+    (:func:`~magrl.pilot.observation.track_observation`)."""
     heading, like = _true(reading, track.state.north).heading.unsqueeze(-1), reading.target
 
     def ahead(vector: Tensor) -> Tensor:
@@ -302,7 +302,7 @@ def act(rules: Rules, track: Track, reading: Reading, network: Callable[[Tensor]
         track: after the reading.
         reading: that reading.
         network: from an :func:`observation` to a correction ``(..., 2)`` of the plan
-            (:func:`~magrl.tracking.planning.corrected`); None to fly as planned.
+            (:func:`~magrl.pilot.planning.corrected`); None to fly as planned.
     """
     plan = track.plan if network is None else corrected(track.plan, network(observation(rules, track, reading)))
     return moving(rules, plan, _true(reading, track.state.north).heading)
@@ -319,15 +319,15 @@ def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> t
     """Return an action ``(..., 2)`` with the declaration ``(..., 3)``: 1 where the vehicle has arrived, else -1.
 
     Where it is probably within the radius, and further readings are not worth their cost
-    (:func:`~magrl.tracking.decision.arrival_decision`), it stays and declares.
+    (:func:`~magrl.pilot.decision.arrival_decision`), it stays and declares.
     Before, where its estimated distance is less than the radius, it approaches the estimated place and stops where
-    readings are worth most (:func:`~magrl.tracking.decision.approach`). Elsewhere it moves as ``action`` says.
+    readings are worth most (:func:`~magrl.pilot.decision.approach`). Elsewhere it moves as ``action`` says.
     """
     state, left = track.state, rules.max_steps - 1 - reading.step
     price = rules.step_price if reading.price is None else reading.price
-    trip = Trip(state.path, state.home, left, price, rules.max_leg_km)
+    progress = Progress(state.path, state.home, left, price, rules.max_leg_km)
     goal, std = track.goal or _goal(rules, state, reading), _accuracy(state, reading)
-    decision = arrival_decision(goal, track.posterior, std, trip, rules.radius_km)
+    decision = arrival_decision(goal, track.posterior, std, progress, rules.radius_km)
     heading = _true(reading, state.north).heading.unsqueeze(-1)
     displacement, stop = (part.to(action.dtype) for part in (decision.displacement, decision.stop_km.unsqueeze(-1)))
     near = displacement.norm(dim=-1, keepdim=True) < rules.radius_km

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from magrl.geodesy import curvature_radii
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, arc, constant, field_rows, generators, powers, size
-from magrl.tracking.prior import DEGREE, HIGHEST, closure
+from magrl.pilot.harmonics import RADIUS, UNIT_KM, arc, constant, field_rows, generators, powers, size
+from magrl.pilot.prior import DEGREE, HIGHEST, closure
 
 COEFFICIENTS = size(DEGREE)
 """Number of coefficients of a belief."""

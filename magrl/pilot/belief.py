@@ -1,6 +1,6 @@
 """What a vehicle knows of the field around it: one normal distribution, and how legs and readings change it.
 
-The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.tracking.harmonics`, the first
+The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.pilot.harmonics`, the first
 three are the field itself), a magnetic anomaly, the error of the estimated place, the drift of dead reckoning, and the
 errors of the readings: constant ones of D, I, B_H, and a field that turns with the vehicle, such as by hard iron. The
 anomaly is the field of the crust and of magnetic weather, three components that vary along the path as a first-order
@@ -33,11 +33,11 @@ from torch.nn.functional import pad
 
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.geodesy import move_place
+from magrl.pilot.earth import EarthModel
+from magrl.pilot.harmonics import UNIT_KM, arc, generators, turning
+from magrl.pilot.local import COEFFICIENTS, carry, closed_derivatives, inverse3, radii, slopes
+from magrl.pilot.prior import ANGLES, DEGREE, closure, expected, lasting_covariances, latitude_cells
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.earth import EarthModel
-from magrl.tracking.harmonics import UNIT_KM, arc, generators, turning
-from magrl.tracking.local import COEFFICIENTS, carry, closed_derivatives, inverse3, radii, slopes
-from magrl.tracking.prior import ANGLES, DEGREE, closure, expected, lasting_covariances, latitude_cells
 
 PLACE = slice(COEFFICIENTS, COEFFICIENTS + 2)
 """True minus estimated place, northward and eastward [km] in the state."""

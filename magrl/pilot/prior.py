@@ -2,7 +2,7 @@
 
 The Gauss coefficients of :func:`~magrl.field.planets.random_planets` are independent, and but for the axial dipole all
 of a degree have one variance. About local axes (the pole is in the direction of z) a coefficient of degree n and order
-m has these local coefficients (:mod:`~magrl.tracking.harmonics`), of that order and of each degree k from max(m, 1) on:
+m has these local coefficients (:mod:`~magrl.pilot.harmonics`), of that order and of each degree k from max(m, 1) on:
 
     -(-1)^(n + m) sqrt((2 - delta_m0) / ((n - m)! (n + m)!)) (n + k)! R^(1 - k)    (half of it where m > 0)
 
@@ -19,8 +19,8 @@ from torch import Tensor
 
 from magrl.field.elements import elements_jacobian
 from magrl.field.planets import gauss_moments
+from magrl.pilot.harmonics import RADIUS, constant, field_rows, generators, orders, size, turning
 from magrl.sensor_std import SensorStd
-from magrl.tracking.harmonics import RADIUS, constant, field_rows, generators, orders, size, turning
 
 DEGREE = 3
 """Highest degree of the coefficients that a belief holds; with 4, nothing is gained (random planets)."""

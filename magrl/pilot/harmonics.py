@@ -40,7 +40,7 @@ T = TypeVar("T")
 UNIT_KM = 1000.0
 """Unit of length of the coefficients [km]."""
 RADIUS = REFERENCE_RADIUS_KM / UNIT_KM
-"""Radius of the sphere on which the vehicle moves [unit]; :mod:`~magrl.tracking` corrects for the ellipsoid."""
+"""Radius of the sphere on which the vehicle moves [unit]; :mod:`~magrl.pilot` corrects for the ellipsoid."""
 
 
 def constant(function: Callable[P, T]) -> Callable[P, T]:

@@ -12,9 +12,9 @@ import torch
 from torch import nn
 
 from magrl.checks import check_choice, check_number, check_type
+from magrl.pilot.observation import OBSERVATION_SIZE
+from magrl.pilot.step import Rules
 from magrl.policy_files import PolicyFile, read_policy, reading
-from magrl.tracking.observation import OBSERVATION_SIZE
-from magrl.tracking.pilot import Rules
 
 _PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
 

@@ -6,7 +6,7 @@ of its innovations, N(r; 0, S); now and then the size changes. What the vehicle 
 distribution with its moments.
 
 All beliefs share one reference place: their estimates of the place differ by their states :data:`PLACE
-<magrl.tracking.belief.PLACE>`.
+<magrl.pilot.belief.PLACE>`.
 
 Source:
     D. T. Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Transactions on Automatic Control 10
@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from magrl.pilot.belief import ANOMALY, STATES, Belief, Innovation, settled
+from magrl.pilot.harmonics import UNIT_KM, constant
+from magrl.pilot.local import inverse3
+from magrl.pilot.prior import lasting_covariances
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import ANOMALY, STATES, Belief, Innovation, settled
-from magrl.tracking.harmonics import UNIT_KM, constant
-from magrl.tracking.local import inverse3
-from magrl.tracking.prior import lasting_covariances
 
 SIZES_NT = (0.0, 30.0, 90.0)
 """Sizes of the anomaly, standard deviations in each axis [nT]; chosen: the crust of WMMHR has 26 to 42. For sizes

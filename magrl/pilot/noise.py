@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.tracking.belief import Innovation
-from magrl.tracking.planning import MISSING_KM, SLOPES
+from magrl.pilot.belief import Innovation
+from magrl.pilot.planning import MISSING_KM, SLOPES
 
 # Chosen on random planets.
 SHEET_READINGS = 4.0
@@ -56,7 +56,7 @@ def noise_estimate(before: NoiseEstimate, new: Innovation, sensor_std: Tensor) -
     The logarithm of R moves by it with the weight ``(R / S)^2``, over the sum of these weights and of
     :data:`SHEET_READINGS`: an innovation that comes from an unknown field says little of the noise. Elements share a
     part of the evidence (:data:`SHARED`), as stated values are often wrong for all of them. An element without noise,
-    or with so much that its reading is missing (:data:`~magrl.tracking.planning.MISSING_KM`), gives no evidence.
+    or with so much that its reading is missing (:data:`~magrl.pilot.planning.MISSING_KM`), gives no evidence.
 
     Args:
         before: estimate before the reading; zeros at the start.
