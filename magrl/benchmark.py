@@ -21,10 +21,10 @@ from torch import Tensor
 
 from magrl import paper
 from magrl.envs import PUBLIC_KEYS, Scenario, Tasks, earth_scenario, named_tasks
+from magrl.errors import Conditions, conditions_named
 from magrl.evaluation import Flight, Sheet
 from magrl.files import write_atomically
 from magrl.sensor_std import PERFECT, STD_KEYS, Noise
-from magrl.transforms import Conditions, conditions_named
 
 LEVELS: tuple[Noise, ...] = (PERFECT.noise, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
-STORM = Path(__file__).parent / "transforms" / "errors" / "storm.toml"
+STORM = Path(__file__).parent / "errors" / "storm.toml"
 """File of the errors of the task *Storm*."""
 EDDY_MOTION: dict[str, Any] = {"eddies_km_h": 0.9, "eddy_km": 250.0, "speed_km_h": 1.0}
-"""Options of :class:`~magrl.transforms.MotionError` in the task *Eddies*."""
+"""Options of :class:`~magrl.errors.MotionError` in the task *Eddies*."""
 
 
 class NamedTask(NamedTuple):
@@ -114,7 +114,7 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
             destinations 300 to 500 km away.
         **options: of :func:`magrl.envs.navigation.navigation_env`, with other defaults: ``observation="track"``,
             ``start_heading="random"`` and ``arrival="distance"`` unless the scenario states them, and errors of its
-            sensors of random size (:func:`magrl.transforms.sensor_levels`).
+            sensors of random size (:func:`magrl.errors.sensor_levels`).
 
     Raises:
         TypeError, ValueError: as :func:`magrl.envs.navigation.navigation_env`.
@@ -124,7 +124,7 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
         torch.Size([4, 3, 19])
     """
     from magrl.envs.navigation import navigation_env
-    from magrl.transforms import SensorErrors, sensor_levels
+    from magrl.errors import SensorErrors, sensor_levels
 
     scenario = _planets() if scenario is None else scenario
     defaults: dict[str, Any] = {"observation": "track"}
@@ -177,7 +177,7 @@ def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = False) -> Sequence[Transform]:
     """Return the errors of *Storm*: magnetic weather of the auroral zone, a drift, and spikes in 5 % of the readings.
 
-    The file ``magrl/transforms/errors/storm.toml`` states their sizes, which are chosen.
+    The file ``magrl/errors/storm.toml`` states their sizes, which are chosen.
 
     Args:
         record: another record of the weather.
@@ -187,7 +187,7 @@ def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = Fals
         >>> [type(error).__name__ for error in storm_errors()]
         ['MagneticWeather', 'SensorErrors', 'Spikes']
     """
-    from magrl.transforms import load_conditions
+    from magrl.errors import load_conditions
 
     storm = load_conditions(STORM)
     errors = {error: dict(options) for error, options in storm.errors.items()}
@@ -258,7 +258,7 @@ def eddies_env(num_envs: int = 1, *, eddies_km_h: float = EDDY_MOTION["eddies_km
         torch.Size([4, 3, 45])
     """
     from magrl.envs.navigation import navigation_env
-    from magrl.transforms import MotionError
+    from magrl.errors import MotionError
 
     motion = MotionError(**EDDY_MOTION | {"eddies_km_h": eddies_km_h})
     rules = {"max_leg_km": 25.0, "max_steps": 60, "arrival": "distance", "start_heading": "random"}

@@ -23,6 +23,7 @@ from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.envs.scenario import rule_settings
+from magrl.errors import MotionError, SensorErrors, sensor_levels
 from magrl.pilot import Rules
 from magrl.pilot.destination import RANGE_KM
 from magrl.pilot.network import correction_network
@@ -45,13 +46,10 @@ from magrl.transforms import (
     DeclareArrival,
     HighestSPL,
     MinMaxNorm,
-    MotionError,
     RandomStepPrice,
-    SensorErrors,
     SPLReward,
     TrackField,
     TrueDisplacement,
-    sensor_levels,
 )
 from magrl.transforms.track import known_keys
 
@@ -98,7 +96,7 @@ class Config(rule_settings("zeta", "arrival", "radius_km", "max_leg_km", "max_tu
     noise: Noise = (0.0, 0.0, 0.0)
     """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT]; random levels by default."""
     noise_exponent: Positive = 1.0
-    """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
+    """Exponent of the random noise levels; larger values give more noise (magrl.errors.sensor_levels)."""
     num_cells: Widths = (128, 128, 128)
     """Width of each hidden layer."""
     range_km: Positive = RANGE_KM

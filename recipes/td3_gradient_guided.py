@@ -23,11 +23,12 @@ from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.envs.navigation import guidance
 from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
+from magrl.errors import SensorErrors
 from magrl.named_tasks import NAMED_TASKS
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
 from magrl.training.run import make_collector
-from magrl.transforms import DistanceCost, EpisodeSum, ProgressReward, SensorErrors, TrueDisplacement
+from magrl.transforms import DistanceCost, EpisodeSum, ProgressReward, TrueDisplacement
 
 import torch
 from pydantic import Field, model_validator

@@ -29,13 +29,13 @@ from magrl.benchmark import LEVELS
 from magrl.checks import CheckedModel
 from magrl.envs import PUBLIC_KEYS, earth_scenario, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, GeomagneticNavVectorEnv
+from magrl.errors import SensorErrors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.sensor_std import Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.config import Count, Rising, Seed
-from magrl.transforms import SensorErrors
 
 import numpy as np
 import torch
@@ -86,7 +86,7 @@ def make_envs(config: Config, noise: Noise) -> tuple[GeomagneticNavVectorEnv, st
     errors = [SensorErrors(noise)]
     envs = GeomagneticNavVectorEnv(config.episodes, task="anywhere", scenario=scenario, transforms=errors, **options)
     parts = f"scenario=magrl.envs.{config.field}_scenario({config.regions}, {config.seed}, **{region})"
-    parts += f", transforms=[magrl.transforms.SensorErrors({noise})], **{options}"
+    parts += f", transforms=[magrl.errors.SensorErrors({noise})], **{options}"
     return envs, f"gymnasium.make_vec({ANYWHERE_ID!r}, num_envs={config.episodes}, {parts})"
 
 

@@ -8,10 +8,10 @@ The action of this agent is the leg itself; `anywhere` corrects the leg that `ka
 
 from magrl import earth_scenario, evaluate, summarize
 from magrl.envs.sb3 import BatchedVecEnv
+from magrl.errors import SensorErrors
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.tables import short_table
 from magrl.named_tasks import anywhere_env
-from magrl.transforms import SensorErrors
 
 import gymnasium
 from stable_baselines3 import PPO

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
 from magrl.geodesy import geodesic, move_place, polar, steer
 from magrl.named_tasks import EDDY_MOTION
 from magrl.navigators import Navigator
-from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
 
 import torch
 from tensordict import TensorDictBase

@@ -19,13 +19,13 @@ from typing import Any
 
 from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
+from magrl.errors import Conditions, load_conditions
 from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import KINDS
 from magrl.field import IGRF, elements_gradient_at
 from magrl.files import check_writable, read_text, write_text, write_with
 from magrl.training import UsageError, command
-from magrl.transforms import Conditions, load_conditions
 
 import numpy as np
 import torch

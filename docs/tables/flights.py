@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from magrl.benchmark import TRACKS, Track
+from magrl.errors import Conditions
 from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import named
@@ -18,7 +19,6 @@ from magrl.evaluation.tables import about, mean_of_runs
 from magrl.files import check_writable, write_with
 from magrl.geodesy import geodesic, move_place, polar
 from magrl.sensor_std import Noise
-from magrl.transforms import Conditions
 
 import torch
 from matplotlib.figure import Figure

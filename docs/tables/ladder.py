@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bars import BARS, flown
+from magrl.errors import SensorErrors
 from magrl.evaluation.scores import scored
 from magrl.evaluation.tables import markdown_table
 from magrl.field.records import weather_record
 from magrl.files import write_text
 from magrl.named_tasks import storm_errors
 from magrl.training import command
-from magrl.transforms import SensorErrors
 
 import tyro
 from tqdm import tqdm

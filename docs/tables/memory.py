@@ -16,6 +16,7 @@ from typing import Any
 from bars import BARS
 from magrl import paper
 from magrl.envs import planet_scenario
+from magrl.errors import CONDITIONS
 from magrl.evaluation import score
 from magrl.evaluation.tables import markdown_table
 from magrl.field import WeatherRecord, weather_record
@@ -23,7 +24,6 @@ from magrl.files import write_text
 from magrl.named_tasks import storm_errors
 from magrl.navigators.memory import LIMITS
 from magrl.training import command
-from magrl.transforms import CONDITIONS
 
 import tyro
 from torch import Tensor

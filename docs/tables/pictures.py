@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from magrl.envs import Region
 from magrl.envs.rendering import AREA, ELEMENT_COLORS, START, SYMBOLS, TARGET, contour_lines
+from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.maps import LAND, coastlines, displacement_ellipse
@@ -28,7 +29,6 @@ from magrl.geodesy import geodesic
 from magrl.named_tasks import EDDY_MOTION, NAMED_TASKS
 from magrl.training import command
 from magrl.transforms.areas import outlines
-from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
 
 import numpy as np
 import torch

@@ -27,10 +27,11 @@ from magrl.envs.regions import Regions, one_region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
+from magrl.errors.base import LEG_ERROR
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, geodesic, move, polar, wrap_angle
 from magrl.pilot.records import EpisodeRules
-from magrl.transforms.errors.base import EPISODE_STREAM, LEG_ERROR
+from magrl.transforms.episode import EPISODE_STREAM
 from magrl.transforms.views import ObservationView
 
 
@@ -46,7 +47,7 @@ class GeomagneticNavEnv(EnvBase):
         scenario: region, field, tasks, and rules of an episode; by default the paper's. Where it has frozen tasks,
             vehicle i flies task ``i + k * num_envs`` in episode k, counted around the set.
         num_envs: number of vehicles in the batch.
-        drift_km: how much farther than its command a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
+        drift_km: how much farther than its command a :class:`~magrl.errors.MotionError` may carry a vehicle [km].
             Above 0, the key ``leg_error`` ``(N, 2)`` holds what such an error adds to a leg, northward and eastward
             [km].
         destination_weight: reward at arrival, zeta_1.

@@ -94,7 +94,7 @@ def navigation_env(
     for transform in _observation(env, observation, **switches):
         env.append_transform(transform)
     if scale_actions:
-        own = all(type(step).__module__.startswith("magrl.transforms") for step in _parts(transforms))
+        own = all(type(step).__module__.startswith(("magrl.transforms", "magrl.errors")) for step in _parts(transforms))
         changed = not own or any("action" in step.in_keys_inv for step in env.transform)
         space = base.action_spec.space
         bounds = {} if changed else {"action": (space.low[0], space.high[0])}  # else TorchRL computes all specs for it

@@ -12,10 +12,11 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
+from magrl.errors.base import LEG_ERROR
 from magrl.field import FieldBank, FieldModel, elements_at
 from magrl.field.elements import measured_elements
 from magrl.pilot.records import EpisodeRules
-from magrl.transforms.errors.base import EPISODE_STREAM, LEG_ERROR
+from magrl.transforms.episode import EPISODE_STREAM
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Privileged keys of the terms whose sum is ``reward``; 0 at a reset."""
@@ -112,7 +113,7 @@ KEYS = {
 PUBLIC_KEYS = tuple(name for name, key in KEYS.items() if key.public and name not in ("elapsed_steps", DECLARED))
 """Keys that every policy may read, beside ``elapsed_steps``."""
 PRIVILEGED_KEYS = tuple(name for name, key in KEYS.items() if not key.public and name != LEG_ERROR)
-"""Keys that a policy may not read if it navigates by the field alone; :data:`magrl.transforms.TRUE_KEYS` has others."""
+"""Keys that a policy may not read if it navigates by the field alone; :data:`magrl.errors.TRUE_KEYS` has others."""
 
 
 def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor, Tensor]:

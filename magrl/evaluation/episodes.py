@@ -191,7 +191,7 @@ def with_true_field(rollout: TensorDictBase) -> TensorDictBase:
 
     Example:
         >>> from torchrl.envs import TransformedEnv
-        >>> from magrl.transforms import SensorErrors
+        >>> from magrl.errors import SensorErrors
         >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), SensorErrors((0.05, 0.05, 5.0)))
         >>> rollout = env.rollout(2)
         >>> bool((with_true_field(rollout)["next", "field"] == rollout["next", "true_field"]).all())

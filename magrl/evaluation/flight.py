@@ -14,15 +14,16 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_device
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
+from magrl.errors import KnownPlace, TargetErrors, with_conditions
+from magrl.errors.conditions import CONDITIONS, Conditions, conditions_named
+from magrl.errors.north import MAGNETIC
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import Navigator, policy_env
 from magrl.pilot import Rules, earth_model
 from magrl.pilot.records import Known
 from magrl.sensor_std import PERFECT, Noise, North, SensorStd
-from magrl.transforms import KnownPlace, TargetErrors, TrackField, with_conditions
-from magrl.transforms.errors.conditions import CONDITIONS, Conditions, conditions_named
-from magrl.transforms.errors.north import MAGNETIC
+from magrl.transforms import TrackField
 from magrl.transforms.track import known_keys
 
 _NOISE = "Errors of the readings [deg, deg, nT]"
@@ -45,7 +46,7 @@ class Sheet(Known):
     declare it here, or in :class:`~magrl.pilot.records.Known` if the pilot uses it, and use it.
 
     Args:
-        errors: also :class:`~magrl.transforms.Conditions`.
+        errors: also :class:`~magrl.errors.Conditions`.
         start_km: as in :class:`~magrl.pilot.records.Known`, with ``target_std`` and ``confidence``.
 
     Raises:

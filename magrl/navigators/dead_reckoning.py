@@ -14,7 +14,7 @@ from magrl.geodesy import geodesic, move_place, steer
 from magrl.navigators.base import Navigator
 from magrl.pilot.earth import EarthModel
 from magrl.sensor_std import SensorStd
-from magrl.transforms.errors.known import PLACE_KEYS
+from magrl.transforms.track import PLACE_KEYS
 
 ARRIVED_KM = 0.5
 """Reckoned distance from the destination at which it has arrived [km]."""
@@ -24,7 +24,7 @@ class DeadReckoning(Navigator):
     """Steer to the coordinates of the destination by the reckoned place alone; the field is not read.
 
     What every vehicle with a known start does without this library. Where the environment has no
-    :class:`~magrl.transforms.KnownPlace`, start and destination are the environment's, without an error.
+    :class:`~magrl.errors.KnownPlace`, start and destination are the environment's, without an error.
     Headings from magnetic north are corrected by the declination of a chart at the reckoned place, if it has one. Where
     the arrival must be declared, it declares at the reckoned destination.
 

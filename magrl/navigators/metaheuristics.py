@@ -25,7 +25,7 @@ from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import move, wrap_angle
 from magrl.navigators.base import Navigator
 from magrl.sensor_std import SensorStd
-from magrl.transforms.errors.base import EPISODE_STREAM
+from magrl.transforms.episode import EPISODE_STREAM
 
 Evaluate = Callable[[Tensor], Tensor]
 """From candidates ``(N, K, 2)`` to their fitness ``(N, K)``."""

@@ -30,6 +30,7 @@ from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.envs.measures import summarize
+from magrl.errors import SensorErrors
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere
@@ -38,7 +39,6 @@ from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, c
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
 from magrl.training.wandb_run import WandbRun
-from magrl.transforms import SensorErrors
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
 """Measures of the validation tasks in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""

@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Composite
 from magrl.checks import check_number
 from magrl.counters import stream_uniform
 from magrl.geodesy import move_place, polar
-from magrl.transforms.errors.base import Episode, EpisodeNumbers
+from magrl.transforms.episode import Episode, EpisodeNumbers
 
 ALONG, ACROSS_KM = (0.2, 0.8), 80.0
 """Centers lie at this share of the displacement from the destination to the start, and up to so far beside it [km]."""
@@ -33,7 +33,7 @@ class NoGoAreas(EpisodeNumbers):
 
     Args:
         number: discs of an episode.
-        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`. The
+        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.episode.EpisodeNumbers`. The
             keys read are the true displacement ``(..., 2)`` in the frame of the vehicle [km], heading ``(..., 1)``
             [rad], and the flags ``success``, ``terminated``, ``truncated`` and ``done`` ``(..., 1)``, which are also
             written. ``areas`` ``(..., 9)`` has for each disc in sight 1 at its edge to 0 at the limit of sight,

@@ -15,7 +15,7 @@ from magrl.checks import check_number, check_numbers
 from magrl.counters import stream_uniform
 from magrl.geodesy import geodesic
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward, key_list
-from magrl.transforms.errors.base import Episode, EpisodeNumbers
+from magrl.transforms.episode import Episode, EpisodeNumbers
 
 SPL_REWARD = 10.0
 """Reward for an SPL of 1."""
@@ -175,7 +175,7 @@ class RandomStepPrice(EpisodeNumbers):
 
     Args:
         price_range: lowest and highest price [% of SPL].
-        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`.
+        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.episode.EpisodeNumbers`.
 
     Raises:
         ValueError: for other than two rising numbers above 0.

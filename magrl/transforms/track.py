@@ -22,10 +22,11 @@ from magrl.pilot.records import State
 from magrl.pilot.step import observation
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
-from magrl.transforms.errors.known import PLACE_KEYS
 
 READ_KEYS = ("field", "target_field", "leg", "heading", "elapsed_steps")
 """Keys that a track reads at each step."""
+PLACE_KEYS = ("start_place", "target_place")
+"""Keys of places that a vehicle knows; see :class:`KnownPlace`."""
 KNOWN_KEYS = (*STD_KEYS, *PLACE_KEYS, "step_price")
 """Keys that it reads where an environment has them: the accuracy of readings, known places, a price."""
 

@@ -22,7 +22,8 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
 from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout
 from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
-from magrl.transforms import ReadingView, SensorErrors
+from magrl.errors import SensorErrors
+from magrl.transforms import ReadingView
 
 NOISE = (0.05, 0.05, 5.0)
 LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}

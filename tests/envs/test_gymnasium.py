@@ -22,11 +22,12 @@ from torchrl.envs import Compose, TransformedEnv
 import magrl
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, geomagnetic, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
+from magrl.errors import SensorErrors
 from magrl.evaluation import episode_measures
 from magrl.field import elements_at
 from magrl.named_tasks import NAMED_TASKS, anywhere_env
 from magrl.pilot.observation import OBSERVATION_SIZE
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorErrors, TargetDifference
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, TargetDifference
 
 PAPER = Scenario(field=Scenario().build_field())
 """The paper's scenario, with its field built once for all tests."""

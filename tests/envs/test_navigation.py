@@ -13,11 +13,12 @@ from torchrl.envs import CatTensors, Compose, Transform, TransformedEnv
 
 from magrl.envs import PAPER_REGION, Region, Scenario
 from magrl.envs.navigation import navigation_env
+from magrl.errors import NorthReferenceError, SensorErrors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.navigators import Geodesic
 from magrl.pilot import Rules
-from magrl.transforms import DeclareArrival, GradientHeading, NorthReferenceError, SensorErrors, TrackField
+from magrl.transforms import DeclareArrival, GradientHeading, TrackField
 
 
 def test_rewards() -> None:

@@ -31,6 +31,7 @@ from magrl.envs.measures import (
     wilson_interval,
 )
 from magrl.envs.navigation import navigation_env
+from magrl.errors import SensorErrors
 from magrl.evaluation import Flight
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import (
@@ -39,7 +40,6 @@ from magrl.evaluation.episodes import (
 )
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import Secant, policy_env
-from magrl.transforms import SensorErrors
 
 
 def test_every_task_is_flown_once_with_errors_of_its_own() -> None:

@@ -11,11 +11,11 @@ import torch
 
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
+from magrl.errors import CONDITIONS
 from magrl.evaluation import Sheet
 from magrl.evaluation.navigators import PRETRAINED
 from magrl.navigators import NAVIGATORS
 from magrl.training import UsageError
-from magrl.transforms import CONDITIONS
 
 NOISE = (0.05, 0.05, 5.0)
 TARGET = ("--target-std", "0.01", "0.02", "3")

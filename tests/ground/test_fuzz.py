@@ -13,9 +13,10 @@ from support.networks import network_file
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
+from magrl.errors import load_conditions
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
-from magrl.transforms import ReadingView, load_conditions
+from magrl.transforms import ReadingView
 
 AZORES = Path(__file__).parents[2] / "docs" / "examples" / "azores.toml"
 MUTANTS = 80

@@ -12,12 +12,12 @@ from torchrl.envs import TransformedEnv
 
 import magrl
 from magrl.envs import GeomagneticNavEnv
+from magrl.errors import SensorErrors
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import Anywhere, Kalman, policy_env
 from magrl.pilot import Rules
 from magrl.pilot.network import correction_network, pretrained
-from magrl.transforms import SensorErrors
 
 
 def test_an_untrained_correction_is_the_leg_of_kalman() -> None:

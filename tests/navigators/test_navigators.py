@@ -13,6 +13,7 @@ from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, task_set
+from magrl.errors import Conditions, SensorErrors, with_conditions
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
@@ -23,7 +24,6 @@ from magrl.navigators.metaheuristics import Metaheuristic
 from magrl.navigators.quasi_newton import probe_length
 from magrl.pilot import earth_model
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import Conditions, SensorErrors, with_conditions
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from support.public_names import public_members
 
 from magrl.field import IGRF
 
-HOMES = ("field", "transforms", "envs", "navigators")
+HOMES = ("field", "transforms", "errors", "envs", "navigators")
 VALUES: dict[str, Any] = {
     **dict.fromkeys(("radius_km", "max_leg_km", "speed_km_h"), 25.0),
     **dict.fromkeys(("max_turn_rad", "cost"), 1.5),

@@ -16,12 +16,13 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig, export_policy
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
+from magrl.errors import CONDITIONS, TRUE_KEYS, MagneticNorth, TargetErrors
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS
 from magrl.pilot import Rules
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import CONDITIONS, TRUE_KEYS, MagneticNorth, ReadingView, TargetErrors, TrackField
-from magrl.transforms.errors.base import EPISODE_STREAM
+from magrl.transforms import ReadingView, TrackField
+from magrl.transforms.episode import EPISODE_STREAM
 
 ORACLES = {"parallel", "geodesic", "ga", "pso", "afsa"}
 PLACES = {"dead_reckoning": ("start_position", "target_position")}

@@ -21,11 +21,11 @@ from support.recipes import ROOT, small
 from tensordict import TensorDict
 
 from magrl import GeomagneticNavEnv, Scenario, evaluate, evaluation_rollout, load_policy, paper, planet_scenario
+from magrl.errors import SensorErrors
 from magrl.named_tasks import eddies_env, no_go_env
 from magrl.navigators import policy_env
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
-from magrl.transforms import SensorErrors
 
 RECIPES = (recipe, ppo_anywhere, ppo_memory)
 NOISE = (0.05, 0.05, 5.0)

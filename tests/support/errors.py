@@ -10,7 +10,7 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from magrl.envs import GeomagneticNavEnv
-from magrl.transforms import ERRORS, Conditions, MotionError, SensorErrors
+from magrl.errors import ERRORS, Conditions, MotionError, SensorErrors
 
 STD = (0.05, 0.05, 5.0)
 

@@ -10,6 +10,7 @@ from types import ModuleType
 PACKAGES = (
     "field",
     "transforms",
+    "errors",
     "envs",
     "navigators",
     "agents",

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from magrl import evaluate
 from magrl.envs import Scenario, earth_scenario
+from magrl.errors import CONDITIONS
 from magrl.field import IGRF
 from magrl.field.elements import elements_jacobian, measured_elements
 from magrl.geodesy import geodesic, move, move_place
@@ -22,7 +23,6 @@ from magrl.pilot.local import slopes
 from magrl.pilot.prior import lasting_covariances
 from magrl.pilot.survey import surveyed
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.transforms import CONDITIONS
 
 PLACES = torch.tensor([[50.0, 10.0], [-20.0, 150.0], [70.0, -120.0], [5.0, 179.9]], dtype=torch.float64)
 

@@ -16,6 +16,7 @@ from torchrl.envs import Compose, EnvBase, PendulumEnv, SerialEnv, Transform, Tr
 from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import GeomagneticNavEnv
+from magrl.errors import KnownPlace, MagneticNorth, SensorErrors, TargetErrors, sensor_levels
 from magrl.pilot import Rules
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms import (
@@ -27,20 +28,15 @@ from magrl.transforms import (
     FieldGradient,
     GradientHeading,
     HighestSPL,
-    KnownPlace,
-    MagneticNorth,
     MinMaxNorm,
     NoGoAreas,
     ProgressReward,
     RandomStepPrice,
     ReadingObservation,
-    SensorErrors,
     SPLReward,
     TargetDifference,
-    TargetErrors,
     TrackField,
     TrueDisplacement,
-    sensor_levels,
 )
 from magrl.transforms.base import key_list
 

@@ -16,7 +16,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from magrl import Scenario, transforms
+from magrl import Scenario, errors, transforms
 from magrl.pilot import Rules
 from magrl.transforms import AngleVector, DeclareArrival, EpisodeSum, MinMaxNorm, TrackField
 from magrl.transforms.base import StatefulTransform
@@ -90,14 +90,14 @@ OPTIONS: dict[type[Transform], dict] = {
     transforms.DistanceCost: {"cost": 0.1},
     transforms.FieldGradient: {"field": waves},
     transforms.Fix: {"field": paper_field(), "region": Scenario().edge},
-    transforms.KnownPlace: {"start_km": 5.0, "target_km": 5.0},
-    transforms.MagneticWeather: {"speed_km_h": 20, "span_h": 9},
-    transforms.MotionError: {"log_scale": 0.1},
-    transforms.NorthReferenceError: {"constant_deg": 2.0},
+    errors.KnownPlace: {"start_km": 5.0, "target_km": 5.0},
+    errors.MagneticWeather: {"speed_km_h": 20, "span_h": 9},
+    errors.MotionError: {"log_scale": 0.1},
+    errors.NorthReferenceError: {"constant_deg": 2.0},
     transforms.RandomStepPrice: {"price_range": (0.1, 1.0)},
-    transforms.SensorErrors: {"noise": STD},
-    transforms.TargetErrors: {"target_std": STD},
-    transforms.Spikes: {"sizes": STD, "rate": 0.5},
+    errors.SensorErrors: {"noise": STD},
+    errors.TargetErrors: {"target_std": STD},
+    errors.Spikes: {"sizes": STD, "rate": 0.5},
 }
 IN_KEYS = {AngleVector: ["heading"], EpisodeSum: ["number"], MinMaxNorm: ["leg"]}
 IN_KEYS |= {
@@ -106,7 +106,7 @@ IN_KEYS |= {
     DeclareArrival: READ_KEYS,
 }
 OUT_KEYS = {AngleVector: ["course"], EpisodeSum: ["episode_number"], MinMaxNorm: ["scaled"]}
-FIXED = (transforms.MagneticNorth, transforms.TargetErrors, EpisodeSum, DeclareArrival)
+FIXED = (errors.MagneticNorth, errors.TargetErrors, EpisodeSum, DeclareArrival)
 """Those whose out_keys follow from their in_keys."""
 
 

@@ -12,11 +12,12 @@ from torch.testing import assert_close
 from torchrl.envs import Compose, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions
+from magrl.errors import MotionError
 from magrl.field.model import elements_at
 from magrl.field.spherical import SphericalHarmonicField
 from magrl.geodesy import geodesic
 from magrl.named_tasks import eddies_env
-from magrl.transforms import Fix, MotionError, RecentLegs
+from magrl.transforms import Fix, RecentLegs
 
 BASE = paper_env(1)
 MAP = Fix(BASE.field, BASE.region.expanded(5.0))

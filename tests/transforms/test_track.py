@@ -15,13 +15,14 @@ from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from magrl.envs import GeomagneticNavEnv
+from magrl.errors import KnownPlace, SensorErrors
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
 from magrl.navigators import Secant, policy_env
 from magrl.pilot import Rules, Track, advance, begin, declaring
 from magrl.pilot.step import observation
-from magrl.transforms import DeclareArrival, KnownPlace, SensorErrors, TrackField
+from magrl.transforms import DeclareArrival, TrackField
 from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, known_keys, reading_of, track_of
 
 BIAS, SMALL_BIAS = (0.5, 0.3, 60.0), (0.1, 0.1, 10.0)

@@ -26,6 +26,7 @@ from torchrl.envs.utils import step_mdp
 
 from magrl.agents import FieldPolicy, PolicyConfig, export_policy
 from magrl.envs import GeomagneticNavEnv
+from magrl.errors import MagneticNorth, SensorErrors
 from magrl.evaluation.episodes import restart
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import IGRF, elements_at
@@ -34,7 +35,7 @@ from magrl.navigators import Anywhere, Navigator, policy_env
 from magrl.pilot import Rules
 from magrl.pilot.network import load_pilot, pretrained, save_pilot
 from magrl.sensor_std import SensorStd
-from magrl.transforms import MagneticNorth, ReadingView, SensorErrors
+from magrl.transforms import ReadingView
 from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)

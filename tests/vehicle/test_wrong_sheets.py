@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ppigrf import igrf
 from ppigrf.ppigrf import shc_fn_igrf14
 
+from magrl.errors import CONDITIONS, Conditions
 from magrl.field import WMMHR
-from magrl.transforms import CONDITIONS, Conditions
 from magrl.vehicle.onboard import Command, Onboard
 
 FLIGHTS, CONFIDENCE, RADIUS_KM, START_KM, STORM_KM = 12, 0.9, 25.0, 5.0, 667.0

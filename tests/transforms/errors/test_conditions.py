@@ -17,24 +17,25 @@ from torchrl.envs.utils import step_mdp
 from magrl import Anywhere, Kalman
 from magrl.counters import stream_normal
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
+from magrl.errors import (
+    CONDITIONS,
+    ERRORS,
+    Conditions,
+    Spikes,
+    VectorErrors,
+    conditions_named,
+    load_conditions,
+    with_conditions,
+)
+from magrl.errors.base import TYPICAL_FIELD, ReadingErrors, true_keys
 from magrl.evaluation import Sheet, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
 from magrl.navigators import Secant, policy_env
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
-from magrl.transforms import (
-    CONDITIONS,
-    ERRORS,
-    Conditions,
-    Spikes,
-    TrackField,
-    VectorErrors,
-    conditions_named,
-    load_conditions,
-    with_conditions,
-)
-from magrl.transforms.errors.base import TYPICAL_FIELD, Episode, ReadingErrors, true_keys
+from magrl.transforms import TrackField
+from magrl.transforms.episode import Episode
 
 NAMES = [name for name in CONDITIONS if name != "laboratory"]
 

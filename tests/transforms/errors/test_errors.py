@@ -11,11 +11,11 @@ from torchrl.envs import EnvBase, SerialEnv
 
 from magrl.counters import advanced, counter_stream
 from magrl.envs.random_regions import planet_scenario
+from magrl.errors import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors, TargetErrors
+from magrl.errors.base import gauss_markov
 from magrl.geodesy import geodesic
 from magrl.named_tasks import anywhere_env
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors, TargetErrors
-from magrl.transforms.errors.base import gauss_markov
 
 ERRORS = {"motion_error": 0, "weather_clock": 0, "sensor_error": 6, "north_error": 0}
 """Keys of the errors of an episode, and how many of their first numbers change with each reading."""

@@ -14,12 +14,12 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl import GeomagneticNavEnv
 from magrl.envs import Scenario
+from magrl.errors import NORTH_REFERENCES, MagneticNorth, MotionError, NorthReferenceError, north_reference
+from magrl.errors.base import true_keys
+from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
 from magrl.evaluation import Flight, evaluate
 from magrl.geodesy import geodesic, move
 from magrl.sensor_std import SensorStd
-from magrl.transforms import NORTH_REFERENCES, MagneticNorth, MotionError, NorthReferenceError, north_reference
-from magrl.transforms.errors.base import true_keys
-from magrl.transforms.errors.motion import EDDIES, eddy_velocity, eddy_waves
 
 F64 = torch.float64
 

@@ -11,11 +11,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from magrl.errors import SensorErrors, Spikes, VectorErrors, sensor_levels
+from magrl.errors.sensors import DRIFT_KM
 from magrl.field.elements import field_vector
 from magrl.navigators import Secant, policy_env
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
-from magrl.transforms import SensorErrors, Spikes, VectorErrors, sensor_levels
-from magrl.transforms.errors.sensors import DRIFT_KM
 
 F64 = torch.float64
 

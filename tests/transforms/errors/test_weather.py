@@ -11,10 +11,10 @@ from torchrl.envs import TransformedEnv
 
 from magrl import paper
 from magrl.envs import Scenario, named_tasks
+from magrl.errors import CONDITIONS, Conditions, MagneticWeather
 from magrl.evaluation import Flight
 from magrl.field import WEATHER, WeatherRecord, weather_record
 from magrl.field.elements import field_vector
-from magrl.transforms import CONDITIONS, Conditions, MagneticWeather
 
 NAN = math.nan
 SHIP = CONDITIONS["ship"].speed_km_h

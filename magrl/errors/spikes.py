@@ -11,7 +11,8 @@ from torch import Tensor
 
 from magrl.checks import check_number
 from magrl.counters import normal_of, stream_uniform
-from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes
+from magrl.errors.base import ReadingErrors, check_sizes
+from magrl.transforms.episode import Episode
 
 
 class Spikes(ReadingErrors):
@@ -20,7 +21,7 @@ class Spikes(ReadingErrors):
     Args:
         sizes: standard deviations of a spike of each element in its unit, E numbers.
         rate: probability of a spike in a reading.
-        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`.
+        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.errors.base.ReadingErrors`.
 
     Raises:
         ValueError: for sizes that are negative or not finite, or a rate outside [0, 1].

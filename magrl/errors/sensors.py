@@ -13,9 +13,10 @@ from torch.nn.functional import pad
 
 from magrl.checks import check_number, check_tensor
 from magrl.counters import normal_of, stream_uniform
+from magrl.errors.base import ReadingErrors, build, check_sizes, gauss_markov
+from magrl.errors.vector import VectorErrors
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.transforms.errors.base import Episode, ReadingErrors, build, check_sizes, gauss_markov
-from magrl.transforms.errors.vector import VectorErrors
+from magrl.transforms.episode import Episode
 
 LEVEL_DRAWS = 12
 """Uniform numbers from which the standard deviations of an episode follow."""
@@ -35,7 +36,7 @@ class SensorErrors(ReadingErrors):
 
     ``sensor_std`` is of errors that are new at each reading (noise and rounding), during an outage
     :data:`~magrl.sensor_std.OUTAGE_STD`; ``bias_std`` is of constant and slow errors. Both are roots of sums of
-    variances, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    variances, at :data:`~magrl.errors.base.TYPICAL_FIELD`.
 
     Args:
         noise: white noise.
@@ -46,16 +47,16 @@ class SensorErrors(ReadingErrors):
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
         outage_rate: probability that a reading is missing; never the first of an episode.
         vector: errors of a vector magnetometer, where the elements are D, I, B_H; or the options of
-            :class:`~magrl.transforms.VectorErrors` by name.
+            :class:`~magrl.errors.VectorErrors` by name.
         fixed: whether bias and scale are the errors themselves, in every episode.
         levels: function of uniform numbers ``(..., 12)`` in [0, 1), which returns further standard deviations
-            ``(..., 2 E)`` for each vehicle and episode, such as :func:`~magrl.transforms.sensor_levels`: of white
+            ``(..., 2 E)`` for each vehicle and episode, such as :func:`~magrl.errors.sensor_levels`: of white
             noise, then of a bias, whose variance is shared between a constant error and a drift at random.
         in_keys: a value ``(..., E)``; optionally the last leg ``(..., K)``, whose first number is its distance,
             without which the drift is by steps; and optionally the heading ``(..., 1)`` [rad], in whose axes ``vector``
             acts.
         out_keys: the reading ``(..., E)``, in place by default.
-        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the episode are
+        **options: ``seed`` of :class:`~magrl.errors.base.ReadingErrors`. The errors of the episode are
             one tensor at ``sensor_error``, which :meth:`named` splits: ``drift``, ``reading`` (the last one), ``bias``
             and ``scale``, E numbers each, ``vector`` (12) if there is one, and with ``levels`` the drawn standard
             deviations ``noise_std``, ``bias_std`` and ``drift_std``.

@@ -12,9 +12,10 @@ from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number
 from magrl.counters import NORMAL_LIMIT, normal_of, stream_normal, stream_uniform
+from magrl.errors.base import LEG_ERROR, EpisodeErrors
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
 from magrl.transforms.base import observed_spec
-from magrl.transforms.errors.base import LEG_ERROR, Episode, EpisodeErrors
+from magrl.transforms.episode import Episode
 
 EDDIES = 8
 """Number of waves of which a field of eddies is the sum."""
@@ -27,7 +28,7 @@ class MotionError(EpisodeErrors):
     commanded. On the ground the vehicle goes the distance times ``1 + scale + noise``, along its heading plus the
     errors of the compass in motion, plus the current times the distance over the speed. The difference from the command
     is written as ``leg_error``, which the environment adds. The heading itself is right, so a declination measured
-    from it is, too; see :class:`~magrl.transforms.NorthReferenceError` for the contrary.
+    from it is, too; see :class:`~magrl.errors.NorthReferenceError` for the contrary.
 
     Sizes are standard deviations of normal errors, cut at four of them, so that the farthest leg is known
     (:meth:`farthest_km`). The environment must allow it: ``GeomagneticNavEnv(drift_km=...)``. Stands before every
@@ -46,7 +47,7 @@ class MotionError(EpisodeErrors):
         in_keys: last leg ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
             ``(..., 2)`` [deg].
         out_keys: true leg ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
-        **options: ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeErrors`. The errors of the
+        **options: ``seed`` of :class:`~magrl.errors.base.EpisodeErrors`. The errors of the
             episode are scale, compass [deg], direction of the current and phases of the eddies [rad], and with
             eddies the uniform numbers of their directions (:func:`eddy_waves`).
 

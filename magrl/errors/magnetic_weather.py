@@ -14,10 +14,11 @@ from torchrl.data import Composite
 from magrl import paper
 from magrl.checks import check_number, check_type
 from magrl.counters import stream_uniform
+from magrl.errors.base import ReadingErrors
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.field.records import WeatherRecord, weather_record
 from magrl.sensor_std import SensorStd
-from magrl.transforms.errors.base import Episode, ReadingErrors
+from magrl.transforms.episode import Episode
 
 READING_S = 60.0
 """Time that each step takes beside its leg [s], so that standing still takes time; chosen."""
@@ -30,7 +31,7 @@ class MagneticWeather(ReadingErrors):
     ``distance / speed`` and :data:`READING_S`. The variation of the minute in which the step ends is added to the field
     vector; between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the
     record, wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the
-    time of ``trip_km``, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    time of ``trip_km``, at :data:`~magrl.errors.base.TYPICAL_FIELD`.
 
     ``field`` becomes the measured field, and ``true_field`` the field without weather, from which the environment
     computes arrival, objective and reward. In ``Compose``, the weather stands before the errors of the sensors.
@@ -49,7 +50,7 @@ class MagneticWeather(ReadingErrors):
         in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last leg ``(..., K)``, whose first number is the
             distance [km].
         out_keys: the measured elements ``(..., 3)``, in place by default.
-        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
+        **options: ``seed`` of :class:`~magrl.errors.base.ReadingErrors`. The errors of the
             episode, float64, are the minute of the record in which it started, and the minutes since then.
 
     Raises:

@@ -10,15 +10,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.counters import stream_normal
+from magrl.errors.base import EpisodeErrors, check_sizes, folded
 from magrl.transforms.base import Keys
-from magrl.transforms.errors.base import Episode, EpisodeErrors, check_sizes, folded
+from magrl.transforms.episode import Episode
 
 
 class TargetErrors(EpisodeErrors):
     """Give a vehicle the elements at its destination with an error that is drawn for the episode.
 
     What it read is kept at ``exact_target_field`` and given back to the environment for its step, so that objective and
-    arrival stay true. It stands after :class:`~magrl.transforms.MagneticNorth`, if both are used: a vehicle without D
+    arrival stay true. It stands after :class:`~magrl.errors.MagneticNorth`, if both are used: a vehicle without D
     has a ``target_std`` of D of 0.
 
     Args:

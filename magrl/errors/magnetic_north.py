@@ -9,10 +9,11 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from magrl.errors.base import ReadingErrors
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
 from magrl.transforms.base import Keys
-from magrl.transforms.errors.base import Episode, ReadingErrors
+from magrl.transforms.episode import Episode
 
 
 class MagneticNorth(ReadingErrors):

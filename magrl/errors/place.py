@@ -12,10 +12,8 @@ from torch import Tensor
 from magrl.checks import check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import move_place
-from magrl.transforms.errors.base import Episode, EpisodeNumbers
-
-PLACE_KEYS = ("start_place", "target_place")
-"""Keys of places that a vehicle knows; see :class:`KnownPlace`."""
+from magrl.transforms.episode import Episode, EpisodeNumbers
+from magrl.transforms.track import PLACE_KEYS
 
 
 class KnownPlace(EpisodeNumbers):

@@ -13,14 +13,14 @@ import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_type
+from magrl.errors.base import LEG_ERROR, TYPICAL_FIELD, EpisodeErrors
+from magrl.errors.magnetic_weather import MagneticWeather
+from magrl.errors.motion import MotionError
+from magrl.errors.north import NorthReferenceError
+from magrl.errors.sensors import SensorErrors
+from magrl.errors.spikes import Spikes
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
-from magrl.transforms.errors.base import LEG_ERROR, TYPICAL_FIELD, EpisodeErrors
-from magrl.transforms.errors.motion import MotionError
-from magrl.transforms.errors.north import NorthReferenceError
-from magrl.transforms.errors.sensors import SensorErrors
-from magrl.transforms.errors.spikes import Spikes
-from magrl.transforms.errors.weather import MagneticWeather
 
 ERRORS: dict[str, type[EpisodeErrors]] = {
     "motion": MotionError,
@@ -42,8 +42,8 @@ class Conditions:
         name: name for messages and tables.
         speed_km_h: speed of the vehicle [km/h], for currents, the drift of a gyrocompass and the weather.
         errors: options of each error by its name in :data:`ERRORS`. ``"north"`` may be a unit of
-            :data:`~magrl.transforms.NORTH_REFERENCES`, or ``"magnetic"`` for a vehicle that has no true north
-            (:class:`~magrl.transforms.MagneticNorth`).
+            :data:`~magrl.errors.NORTH_REFERENCES`, or ``"magnetic"`` for a vehicle that has no true north
+            (:class:`~magrl.errors.MagneticNorth`).
 
     Raises:
         ValueError: for an unknown error, option, unit or record, or an option that is out of its range.

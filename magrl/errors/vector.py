@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from magrl.errors.base import check_sizes
 from magrl.field.elements import rotation
-from magrl.transforms.errors.base import check_sizes
 
 NO_MATRIX = ((0.0, 0.0, 0.0),) * 3
 

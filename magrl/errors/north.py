@@ -14,11 +14,12 @@ from torch.nn.functional import pad
 
 from magrl.checks import check_choice, check_number
 from magrl.counters import stream_normal
+from magrl.errors.base import EpisodeErrors, ReadingErrors, gauss_markov
+from magrl.errors.magnetic_north import MagneticNorth
 from magrl.geodesy import wrap_angle, wrap_longitude
 from magrl.sensor_std import SensorStd
 from magrl.transforms.base import Keys
-from magrl.transforms.errors.base import Episode, EpisodeErrors, ReadingErrors, gauss_markov
-from magrl.transforms.errors.magnetic_north import MagneticNorth
+from magrl.transforms.episode import Episode
 
 MAGNETIC = "magnetic"
 """North of a vehicle without a true-north reference."""
@@ -71,7 +72,7 @@ class NorthReferenceError(ReadingErrors):
             is the distance [km], and optionally the position ``(..., 2)``, latitude and longitude [deg]: b then grows
             with the secant of the latitude, as with every gyrocompass.
         out_keys: the heading and the elements that the vehicle reads, in place by default.
-        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
+        **options: ``seed`` of :class:`~magrl.errors.base.ReadingErrors`. The errors of the
             episode are constant part, drift and b itself [deg].
 
     Raises:
@@ -123,7 +124,7 @@ class NorthReferenceError(ReadingErrors):
         """Return the error with options by name, of a unit of :data:`NORTH_REFERENCES`, or of a compass alone.
 
         Args:
-            options: options; name of a unit; or :data:`MAGNETIC` for a :class:`~magrl.transforms.MagneticNorth`.
+            options: options; name of a unit; or :data:`MAGNETIC` for a :class:`~magrl.errors.MagneticNorth`.
             speed_km_h: speed of the vehicle [km/h].
             seed: seed of the errors.
 
