@@ -8,7 +8,7 @@ from benchmarks.timing import HEADER, Row, alternate, one_thread
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import policy_env
-from magrl.vehicle.onboard import Onboard
+from magrl.onboard import Onboard
 
 import torch
 from tensordict import TensorDictBase

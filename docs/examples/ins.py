@@ -3,7 +3,7 @@
 from magrl import IGRF
 from magrl.field import elements_at
 from magrl.geodesy import geodesic, move_place
-from magrl.vehicle.onboard import Onboard
+from magrl.onboard import Onboard
 
 import torch
 

@@ -15,8 +15,8 @@ from collections import Counter
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic
-from magrl.vehicle.mistakes import deviation, likely_mistake, model_std
-from magrl.vehicle.onboard import Onboard
+from magrl.onboard import Onboard
+from magrl.onboard.mistakes import deviation, likely_mistake, model_std
 
 import matplotlib.pyplot as plt
 import pandas as pd

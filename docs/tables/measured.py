@@ -19,11 +19,11 @@ from magrl.field import IGRF
 from magrl.field.elements import measured_elements
 from magrl.files import write_text
 from magrl.geodesy import geodesic
+from magrl.onboard.mistakes import MODEL_STD
 from magrl.pilot.belief import Belief, before, known, moved, read
 from magrl.pilot.destination import destination, log_density, posterior
 from magrl.sensor_std import SensorStd
 from magrl.training import command
-from magrl.vehicle.mistakes import MODEL_STD
 
 import pandas as pd
 import torch

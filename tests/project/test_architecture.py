@@ -62,7 +62,7 @@ def test_every_package_and_module_has_a_floor() -> None:
 def test_no_import_upward_and_none_of_vehicles() -> None:
     pairs = [(top(module), top(other)) for module in MODULES for other in imported(module)]
     assert [pair for pair in pairs if FLOOR[pair[1]] > FLOOR[pair[0]]] == []
-    assert {importer for importer, other in pairs if other == "vehicle"} == {"vehicle"}
+    assert {importer for importer, other in pairs if other == "onboard"} == {"onboard"}
 
 
 def test_no_cycle_among_modules() -> None:

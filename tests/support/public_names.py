@@ -14,7 +14,7 @@ PACKAGES = (
     "envs",
     "navigators",
     "agents",
-    "vehicle.onboard",
+    "onboard",
     "evaluation",
     "training",
 )

@@ -13,12 +13,12 @@ from support.tracks import f64
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place, polar
+from magrl.onboard import Command, Onboard
+from magrl.onboard.doubt import Doubt
 from magrl.pilot import advance, earth_model
 from magrl.pilot.belief import PLACE, Motion, at_place, settled, updated
 from magrl.pilot.step import position_fix
 from magrl.sensor_std import OUTAGE_STD, SensorStd
-from magrl.vehicle.onboard import Command, Onboard
-from magrl.vehicle.onboard.doubt import Doubt
 
 BERGEN, DATE, FIELD = (60.4, 5.3), "2026-06-30", IGRF("2026-06-30")
 NEAR = (60.43, 5.3)
@@ -159,7 +159,7 @@ def test_an_estimate_that_is_not_finite_is_refused_and_changes_nothing(monkeypat
         return track._replace(state=track.state._replace(mean=track.state.mean * float("nan")))
 
     with monkeypatch.context() as patch:
-        patch.setattr("magrl.vehicle.onboard.vehicle.advance", wrong)
+        patch.setattr("magrl.onboard.vehicle.advance", wrong)
         with pytest.raises(ValueError, match=r"the estimate is not finite after this leg: check its distance"):
             vehicle.step(*at(0.0, -120.0), **step)
     assert vehicle.step(*at(0.0, -120.0), **step) == other.step(*at(0.0, -120.0), **step)

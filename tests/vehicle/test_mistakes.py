@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from magrl.navigators import Geodesic
+from magrl.onboard import Onboard
 from magrl.sensor_std import SensorStd
-from magrl.vehicle.onboard import Onboard
 
 TARGET, HERE, NOISE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0), (0.02, 0.02, 2.0)
 BERGEN, THERE, DATE = (60.4, 5.3), (2.84, 73.05, 15003.0), {"date": "2026-06-30"}

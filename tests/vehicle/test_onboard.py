@@ -32,11 +32,11 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move, move_place
 from magrl.navigators import Anywhere, Navigator, policy_env
+from magrl.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 from magrl.pilot import Rules
 from magrl.pilot.network import load_pilot, pretrained, save_pilot
 from magrl.sensor_std import SensorStd
 from magrl.transforms import ReadingView
-from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
 SECOND = (3.49, 73.001, 14999.0, 290.0, 0.5)
@@ -225,7 +225,7 @@ def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
         for name in [name for name in sys.modules if name.partition(".")[0] == "magrl"]:
             del sys.modules[name]
         sys.modules |= {name: None for name in list(sys.modules) if name.partition(".")[0] in ("torchrl", "tensordict")}
-        vehicle = importlib.import_module("magrl.vehicle.onboard").Onboard("anywhere", sensor_std=NOISE)
+        vehicle = importlib.import_module("magrl.onboard").Onboard("anywhere", sensor_std=NOISE)
         vehicle.start(TARGET)
         vehicle.step(*HERE, 290.0)
         vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)

@@ -22,7 +22,7 @@ from ppigrf.ppigrf import shc_fn_igrf14
 
 from magrl.errors import CONDITIONS, Conditions
 from magrl.field import WMMHR
-from magrl.vehicle.onboard import Command, Onboard
+from magrl.onboard import Command, Onboard
 
 FLIGHTS, CONFIDENCE, RADIUS_KM, START_KM, STORM_KM = 12, 0.9, 25.0, 5.0, 667.0
 DATE = "2025-01-01"  # the only one of IGRF-13 and WMMHR

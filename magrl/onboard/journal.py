@@ -69,11 +69,11 @@ def _accuracy(value: Any) -> SensorStd:
 
 
 class Options(Inputs, Rules):
-    """Hold the options of :class:`~magrl.vehicle.onboard.Onboard`: all :class:`~magrl.pilot.Rules`, and the sensors.
+    """Hold the options of :class:`~magrl.onboard.Onboard`: all :class:`~magrl.pilot.Rules`, and the sensors.
 
     Args:
         arrival: always declared: nothing tells a vehicle that it has arrived.
-        model: given to :meth:`~magrl.vehicle.onboard.Onboard.start`, as are ``start_km`` and ``target_km``.
+        model: given to :meth:`~magrl.onboard.Onboard.start`, as are ``start_km`` and ``target_km``.
         north: ``"true"``: headings are from true north, and D is measured; or ``"magnetic"``: they are from magnetic
             north, as of a compass, and D is not measured.
         sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
@@ -112,7 +112,7 @@ looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
 
 
 class Step(Inputs):
-    """Hold the arguments of :meth:`~magrl.vehicle.onboard.Onboard.step`.
+    """Hold the arguments of :meth:`~magrl.onboard.Onboard.step`.
 
     Example:
         >>> Step(declination=3.5, inclination=None, horizontal_intensity=15000, heading=float("nan"))
@@ -136,7 +136,7 @@ class Step(Inputs):
 
 
 class Fix(Inputs):
-    """Hold the arguments of :meth:`~magrl.vehicle.onboard.Onboard.fix`.
+    """Hold the arguments of :meth:`~magrl.onboard.Onboard.fix`.
 
     Example:
         >>> Fix(latitude=64.1, longitude=-21.9, std_km=0.0)
@@ -151,7 +151,7 @@ class Fix(Inputs):
 
 
 class Destination(Inputs):
-    """Hold the arguments of :meth:`~magrl.vehicle.onboard.Onboard.retarget`.
+    """Hold the arguments of :meth:`~magrl.onboard.Onboard.retarget`.
 
     Example:
         >>> Destination(target=(64.1, -21.9)).target_km
@@ -223,7 +223,7 @@ class Command:
         anomaly_weights: probabilities that anomalies here are as large as each of
             :data:`~magrl.pilot.anomalies.SIZES_NT`.
         fit: probability that readings as surprising as the first and the last ones occur if everything stated is true;
-            below :data:`~magrl.vehicle.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
+            below :data:`~magrl.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
 
     Example:
         >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km

@@ -18,6 +18,10 @@ from torch import Tensor, nn
 
 from magrl.checks import check_type
 from magrl.files import write_atomically
+from magrl.onboard import limits
+from magrl.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
+from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
+from magrl.onboard.start import check_first_reading, fixed, known_at_start
 from magrl.pilot import Reading, Rules, Track, act, advance, begin, declaring, retargeted
 from magrl.pilot.belief import PLACE
 from magrl.pilot.decision import ArrivalDecision
@@ -25,10 +29,6 @@ from magrl.pilot.earth import NEWEST
 from magrl.pilot.network import pilot_of
 from magrl.pilot.records import State
 from magrl.sensor_std import OUTAGE_STD
-from magrl.vehicle.onboard import limits
-from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
-from magrl.vehicle.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
-from magrl.vehicle.onboard.known import check_first_reading, fixed, known_at_start
 
 USUAL: dict[str, Any] = {
     "arrival": "declared",
@@ -60,7 +60,7 @@ class Onboard:
         navigator: ``"anywhere"`` for the pretrained agent, ``"kalman"``, or a file of
             :func:`~magrl.pilot.network.save_pilot`, which run without TorchRL; ``"secant"``, a file of
             :func:`magrl.save_policy`, a policy or a navigator, of which the vehicle gets a copy.
-        options: of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are from the
+        options: of :class:`~magrl.onboard.journal.Options`. Rules that are not given are from the
             training, but :data:`USUAL`. The limits of a leg are at most the training's limits.
 
     Raises:
@@ -81,7 +81,7 @@ class Onboard:
         pilot, self._other = pilot_of(navigator), None
         rules, self._network = pilot or (Rules(), None)
         if pilot is None:
-            from magrl.vehicle.onboard.others import Other
+            from magrl.onboard.policies import Other
 
             self._other = Other(navigator)
         given = Options(**rules.model_dump() | USUAL | options)

@@ -16,9 +16,9 @@ from magrl.field.elements import NAMES, element_difference
 from magrl.geodesy import wrap_angle
 from magrl.navigators import Memory, Secant
 from magrl.navigators.base import MEMORY
+from magrl.onboard.journal import Options
 from magrl.pilot import Reading
 from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.vehicle.onboard.journal import Options
 
 READS = {*PUBLIC_KEYS, *STD_KEYS, "elapsed_steps", "done"}
 """Keys that a vehicle knows."""

@@ -12,6 +12,9 @@ from torch import Tensor
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import field_vector
 from magrl.field.igrf import parse_date
+from magrl.onboard.journal import Fix, Journal, Triple
+from magrl.onboard.limits import check_earth_reading
+from magrl.onboard.mistakes import deviation, likely_mistake, model_std
 from magrl.pilot import Reading, Rules, earth_model
 from magrl.pilot.anomalies import recentered, reweighed
 from magrl.pilot.belief import updated
@@ -20,9 +23,6 @@ from magrl.pilot.planning import SLOPES
 from magrl.pilot.records import State
 from magrl.pilot.step import position_fix
 from magrl.sensor_std import SensorStd
-from magrl.vehicle.mistakes import deviation, likely_mistake, model_std
-from magrl.vehicle.onboard.journal import Fix, Journal, Triple
-from magrl.vehicle.onboard.limits import check_earth_reading
 
 LEAST_TAIL = 0.01
 """Tail probability below which a first reading does not fit the start. Most of it is of large anomalies, which are
@@ -35,7 +35,7 @@ def known_elements(given: Sequence[float], name: str, model: EarthModel | None) 
 
     Args:
         given: D [deg], I [deg], B_H [nT]; or latitude and longitude, at which they follow from a model with the
-            accuracy of :func:`~magrl.vehicle.mistakes.model_std`.
+            accuracy of :func:`~magrl.onboard.mistakes.model_std`.
         name: name of the place in messages.
         model: model of the Earth; None without a date.
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 
 from magrl.field.elements import NAMES
+from magrl.onboard.journal import Step
 from magrl.pilot import Track
 from magrl.pilot.anomalies import joint_tail
 from magrl.pilot.belief import elements
 from magrl.pilot.records import State
-from magrl.vehicle.onboard.journal import Step
 
 LEAST_FIT = 0.01
 """Fit of the readings (:class:`Command`) below which a vehicle does not say that it has arrived."""
