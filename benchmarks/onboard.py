@@ -6,8 +6,8 @@ import math
 
 from benchmarks.timing import HEADER, Row, alternate, one_thread
 from magrl.envs import GeomagneticNavEnv
-from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import policy_env
+from magrl.navigators.names import make_navigator
 from magrl.onboard import Onboard
 
 import torch

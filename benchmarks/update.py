@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 from benchmarks.timing import Row, alternate
-from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize, saturation_penalty
+from magrl.agents import SoftUpdate, TD3Loss, optimize, saturation_penalty
+from magrl.navigators import make_actor, make_critic
 
 import torch
 from tensordict import TensorDict

@@ -1,9 +1,5 @@
 """Public names and their packages. ``magrl/__init__.py`` loads them when they are first used."""
 
-from .agents import FieldPolicy as FieldPolicy
-from .agents import export_policy as export_policy
-from .agents import load_policy as load_policy
-from .agents import save_policy as save_policy
 from .envs import GeomagneticNavEnv as GeomagneticNavEnv
 from .envs import Region as Region
 from .envs import Scenario as Scenario
@@ -22,7 +18,11 @@ from .field import IGRF as IGRF
 from .field import RegionalField as RegionalField
 from .field import SphericalHarmonicField as SphericalHarmonicField
 from .navigators import Anywhere as Anywhere
+from .navigators import FieldPolicy as FieldPolicy
 from .navigators import Kalman as Kalman
+from .navigators import export_policy as export_policy
+from .navigators import load_policy as load_policy
+from .navigators import save_policy as save_policy
 from .transforms import AlignmentReward as AlignmentReward
 from .transforms import AngleVector as AngleVector
 from .transforms import FieldGradient as FieldGradient

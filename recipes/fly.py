@@ -25,10 +25,10 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import Flight, Sheet, episode_measures
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.navigators import NAMES, named
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
+from magrl.navigators.names import NAMES, named
 from magrl.pilot.displacement import Displacement
 from magrl.training import UsageError, command, parse
 

@@ -19,11 +19,12 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 from magrl import Anywhere, paper
-from magrl.agents import make_correcting_actor, optimize
-from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
+from magrl.agents import optimize
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.envs.scenario import rule_settings
 from magrl.errors import MotionError, SensorErrors, sensor_levels
+from magrl.navigators import make_correcting_actor
+from magrl.navigators.networks import Spread, make_drawn_correction, make_mlp
 from magrl.pilot import Rules
 from magrl.pilot.destination import RANGE_KM
 from magrl.pilot.network import correction_network

@@ -63,7 +63,7 @@ def outcome() -> Callable:
     """Return a function that reads a run folder: the curves without their timing, and the weights of the policy."""
     from torch import Tensor
 
-    from magrl.agents import load_policy
+    from magrl.navigators import load_policy
 
     def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, Tensor]]:
         with (folder / "train.csv").open(encoding="utf-8") as file:

@@ -32,7 +32,7 @@ from magrl.envs.gymnasium import ANYWHERE_ID, GeomagneticNavVectorEnv
 from magrl.errors import SensorErrors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
-from magrl.evaluation.navigators import make_navigator
+from magrl.navigators.names import make_navigator
 from magrl.sensor_std import Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.config import Count, Rising, Seed

@@ -4,7 +4,7 @@ python docs/examples/sac.py    # one to two minutes on one core
 """
 
 from magrl import AlignmentReward, FieldGradient, GeomagneticNavEnv, GradientHeading, evaluate, save_policy, summarize
-from magrl.agents import make_critic
+from magrl.navigators import make_critic
 
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from magrl import score
-from magrl.agents.onnx_policy import exported, with_description
 from magrl.evaluation.tables import markdown_table
 from magrl.files import write_atomically, write_with
+from magrl.navigators.onnx import exported, with_description
 from magrl.training import command
 
 import tyro

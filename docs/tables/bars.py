@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 from currents import CURRENT_RULES
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
-from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
 from magrl.files import read_document
 from magrl.geodesy import steer
 from magrl.named_tasks import NAMED_TASKS, storm_errors
 from magrl.navigators import Navigator, Secant
+from magrl.navigators.names import make_navigator
 from magrl.training import command
 from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, turned
 

@@ -22,9 +22,9 @@ from magrl.envs.rendering import draw_tracks
 from magrl.errors import Conditions, load_conditions
 from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation.maps import coastlines
-from magrl.evaluation.navigators import KINDS
 from magrl.field import IGRF, elements_gradient_at
 from magrl.files import check_writable, read_text, write_text, write_with
+from magrl.navigators.names import KINDS
 from magrl.training import UsageError, command
 
 import numpy as np

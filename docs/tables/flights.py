@@ -14,10 +14,10 @@ from magrl.benchmark import TRACKS, Track
 from magrl.errors import Conditions
 from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
-from magrl.evaluation.navigators import named
 from magrl.evaluation.tables import about, mean_of_runs
 from magrl.files import check_writable, write_with
 from magrl.geodesy import geodesic, move_place, polar
+from magrl.navigators.names import named
 from magrl.sensor_std import Noise
 
 import torch

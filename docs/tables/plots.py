@@ -10,9 +10,9 @@ from typing import Any
 
 from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
-from magrl.evaluation.navigators import KINDS
 from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
+from magrl.navigators.names import KINDS
 
 import numpy as np
 import torch

@@ -57,7 +57,7 @@ class TD3Loss(TorchRLTD3Loss):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from magrl.agents.networks import make_actor, make_critic
+        >>> from magrl.navigators.networks import make_actor, make_critic
         >>> loss = TD3Loss(make_actor(13, (8,)), make_critic(13, (8,)), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
         >>> update = SoftUpdate(loss, tau=0.01)
         >>> obs, ended = torch.zeros(5, 13), torch.ones(5, 1, dtype=torch.bool)
@@ -166,7 +166,7 @@ class SoftUpdate(TorchRLSoftUpdate):
     """TorchRL's Polyak averaging of the target networks, in one call for all parameters.
 
     Example:
-        >>> from magrl.agents.networks import make_actor, make_critic
+        >>> from magrl.navigators.networks import make_actor, make_critic
         >>> loss = TD3Loss(make_actor(13, (8,)), make_critic(13, (8,)), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
         >>> SoftUpdate(loss, tau=0.25).step()
     """

@@ -18,8 +18,8 @@ from magrl.errors import KnownPlace, TargetErrors, with_conditions
 from magrl.errors.conditions import CONDITIONS, Conditions, conditions_named
 from magrl.errors.north import MAGNETIC
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout
-from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import Navigator, policy_env
+from magrl.navigators.names import make_navigator
 from magrl.pilot import Rules, earth_model
 from magrl.pilot.records import Known
 from magrl.sensor_std import PERFECT, Noise, North, SensorStd
@@ -168,7 +168,7 @@ class Flight:
 
         Args:
             policy: policy or navigator of the plain environment, or the text that names one, as
-                :func:`magrl.evaluation.navigators.make_navigator` takes it.
+                :func:`magrl.navigators.names.make_navigator` takes it.
             options: of that function.
 
         Raises:
@@ -214,7 +214,7 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
 
     Args:
         policy: policy or navigator of the plain environment, or the text that names one, as
-            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"sac.onnx"``. A
+            :func:`magrl.navigators.names.make_navigator` takes it: ``"secant"``, ``"sac.onnx"``. A
             trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.

@@ -16,14 +16,14 @@ from torch import nn
 from torch.utils._pytree import tree_map
 
 from magrl import paper
-from magrl.agents.onnx_policy import OnnxNetwork, has_view
 from magrl.checks import check_number, short
 from magrl.envs.measures import summarize
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
-from magrl.evaluation.navigators import make_navigator, named
 from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.navigators import Navigator
+from magrl.navigators.names import make_navigator, named
+from magrl.navigators.onnx import OnnxNetwork, has_view
 
 SEED = paper.FIRST_RESERVED_SEED + 69
 """Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
@@ -37,9 +37,9 @@ def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
     Args:
         agent: one of
 
-            - a name or a file, as :func:`magrl.evaluation.navigators.make_navigator` takes it, or the folder of a run:
+            - a name or a file, as :func:`magrl.navigators.names.make_navigator` takes it, or the folder of a run:
               ``"kalman"``, ``"policy.onnx"``, ``"runs/gg_td3"``; also an ONNX file without a view, as of
-              :class:`magrl.agents.onnx_policy.OnnxNetwork`;
+              :class:`magrl.navigators.onnx.OnnxNetwork`;
             - a TensorDict module that reads ``observation`` and writes ``action`` in [-1, 1], also with recurrent
               modules of TorchRL, or another module of PyTorch from the one to the other;
             - any other TensorDict module, such as a navigator: it reads raw keys, and writes ``action`` in km and rad;

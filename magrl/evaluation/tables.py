@@ -14,13 +14,13 @@ import torch
 
 from magrl import paper
 from magrl.envs.measures import MEASURES, interquartile_mean, stratified_bootstrap
-from magrl.evaluation.navigators import KINDS, Agent, Kind
+from magrl.navigators.names import KINDS, Agent, Kind
 
 Summary = Mapping[str, float | None]
 """From :func:`magrl.evaluation.summarize`; a measure without a value is NaN, or None where it was read from a file."""
 
 Summaries = Mapping[Kind | str, Sequence[Summary]]
-"""By navigator, or its name in :data:`magrl.evaluation.navigators.KINDS`, or a label: a summary of each of its runs."""
+"""By navigator, or its name in :data:`magrl.navigators.names.KINDS`, or a label: a summary of each of its runs."""
 
 MIN_RUNS = 10
 """Minimum number of runs for a bootstrap interval whose coverage is about nominal."""

@@ -10,11 +10,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from magrl.agents import load_policy
 from magrl.envs import PUBLIC_KEYS
 from magrl.field.elements import NAMES, element_difference
 from magrl.geodesy import wrap_angle
-from magrl.navigators import Memory, Secant
+from magrl.navigators import Memory, Secant, load_policy
 from magrl.navigators.base import MEMORY
 from magrl.onboard.journal import Options
 from magrl.pilot import Reading

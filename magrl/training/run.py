@@ -26,14 +26,13 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from magrl import paper
-from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.envs.measures import summarize
 from magrl.errors import SensorErrors
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
 from magrl.files import locked, read_text, write_json
-from magrl.navigators import Anywhere
+from magrl.navigators import Anywhere, FieldPolicy, save_policy
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig

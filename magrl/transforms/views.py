@@ -108,7 +108,7 @@ class _View:
 
     @property
     def geometry(self) -> bool:
-        """Whether :class:`~magrl.agents.networks.AreaGeometry` reads the observation."""
+        """Whether :class:`~magrl.navigators.networks.AreaGeometry` reads the observation."""
         return False
 
     def __post_init__(self) -> None:
@@ -187,7 +187,7 @@ class ObservationView(_View):
 
     @property
     def geometry(self) -> bool:
-        """Whether :class:`~magrl.agents.networks.AreaGeometry` reads the observation: areas, and all else."""
+        """Whether :class:`~magrl.navigators.networks.AreaGeometry` reads the observation: areas, and all else."""
         return self.observe_areas and self.observe_heading and self.observe_difference
 
     def observation_transforms(self) -> list[Transform]:

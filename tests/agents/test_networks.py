@@ -6,8 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from magrl.agents import make_actor
-from magrl.agents.networks import AreaGeometry, CorrectedLeg
+from magrl.navigators import make_actor
+from magrl.navigators.networks import AreaGeometry, CorrectedLeg
 from magrl.pilot import Rules
 from magrl.transforms import NoGoAreas
 from magrl.transforms.areas import distance_km

@@ -21,8 +21,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
 from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout
-from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
 from magrl.errors import SensorErrors
+from magrl.navigators import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
 from magrl.transforms import ReadingView
 
 NOISE = (0.05, 0.05, 5.0)

@@ -8,9 +8,9 @@ import torch
 from torchrl.envs import Compose, TransformedEnv
 
 from magrl import Anywhere, GeomagneticNavEnv, ObservationView, Scenario
-from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.evaluation.navigators import training_settings
 from magrl.files import load_tensors, save_tensors
+from magrl.navigators import FieldPolicy, PolicyConfig, load_policy, save_policy
+from magrl.navigators.names import training_settings
 from magrl.pilot.network import pretrained
 
 CELLS = (16, 16)

@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.objectives import TD3Loss as StockTD3Loss
 
-from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize
+from magrl.agents import SoftUpdate, TD3Loss, optimize
+from magrl.navigators import make_actor, make_critic
 
 CELLS = (16, 16)
 

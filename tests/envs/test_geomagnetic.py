@@ -18,13 +18,13 @@ from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
-from magrl.agents import load_policy
 from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.envs.navigation import navigation_env
 from magrl.envs.specs import REWARD_TERMS
 from magrl.evaluation import Flight
 from magrl.field import IGRF, RegionalField
 from magrl.geodesy import move
+from magrl.navigators import load_policy
 from magrl.pilot.network import pretrained
 
 ANTIMERIDIAN = Region((-5.0, 5.0), (175.0, 185.0))

@@ -18,7 +18,6 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from magrl import Anywhere, episode_measures, evaluate, evaluation_rollout, summarize
-from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.envs.measures import (
     Episode,
@@ -39,7 +38,7 @@ from magrl.evaluation.episodes import (
     moved,
 )
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
-from magrl.navigators import Secant, policy_env
+from magrl.navigators import FieldPolicy, PolicyConfig, Secant, policy_env
 
 
 def test_every_task_is_flown_once_with_errors_of_its_own() -> None:

@@ -9,12 +9,11 @@ import fly
 import pytest
 import torch
 
-from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.errors import CONDITIONS
 from magrl.evaluation import Sheet
-from magrl.evaluation.navigators import PRETRAINED
-from magrl.navigators import NAVIGATORS
+from magrl.navigators import NAVIGATORS, FieldPolicy, PolicyConfig, save_policy
+from magrl.navigators.names import PRETRAINED
 from magrl.training import UsageError
 
 NOISE = (0.05, 0.05, 5.0)

@@ -11,10 +11,9 @@ from support.networks import network_file
 from torchrl.envs import StepCounter, TransformedEnv
 
 from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
-from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.evaluation.navigators import KINDS, PRETRAINED, check_distinct, make_navigator, named, training_settings
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
-from magrl.navigators import NAVIGATORS, Anywhere, policy_env
+from magrl.navigators import NAVIGATORS, Anywhere, FieldPolicy, PolicyConfig, load_policy, policy_env, save_policy
+from magrl.navigators.names import KINDS, PRETRAINED, check_distinct, make_navigator, named, training_settings
 from magrl.navigators.quasi_newton import probe_length
 from magrl.pilot.network import pretrained
 from magrl.sensor_std import SensorStd

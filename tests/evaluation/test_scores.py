@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from torchrl.modules import LSTMModule
 
 from magrl import load_policy, save_policy, score
-from magrl.agents.onnx_policy import with_description
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation.scores import SEED, flown, scored
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import Secant
+from magrl.navigators.onnx import with_description
 
 
 class Toward(nn.Module):

@@ -11,9 +11,9 @@ import td3_gradient_guided as recipe
 import torch
 from support.networks import network_file
 
-from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
 from magrl.errors import load_conditions
+from magrl.navigators import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
 from magrl.transforms import ReadingView

@@ -18,13 +18,12 @@ from torchrl.envs.utils import step_mdp
 from torchrl.modules import LSTMModule
 
 from magrl import FieldPolicy
-from magrl.agents import PolicyConfig
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.arrays import ArrayPolicy
-from magrl.evaluation.navigators import make_navigator
 from magrl.named_tasks import NAMED_TASKS
-from magrl.navigators import NAVIGATORS, Secant, policy_env
+from magrl.navigators import NAVIGATORS, PolicyConfig, Secant, policy_env
 from magrl.navigators.metaheuristics import Metaheuristic
+from magrl.navigators.names import make_navigator
 
 SIZE = 26
 

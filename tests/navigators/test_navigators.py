@@ -15,12 +15,12 @@ from torchrl.envs.utils import step_mdp
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, task_set
 from magrl.errors import Conditions, SensorErrors, with_conditions
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
-from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
 from magrl.guidance import displacement_to
 from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, Secant, policy_env
 from magrl.navigators.metaheuristics import Metaheuristic
+from magrl.navigators.names import make_navigator
 from magrl.navigators.quasi_newton import probe_length
 from magrl.pilot import earth_model
 from magrl.sensor_std import STD_KEYS

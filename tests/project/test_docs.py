@@ -23,12 +23,12 @@ from support.recipes import load
 from torchrl.data import Composite
 
 import magrl
-from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.errors import CONDITIONS
 from magrl.files import read_document
 from magrl.named_tasks import NAMED_TASKS
+from magrl.navigators import FieldPolicy, PolicyConfig, save_policy
 
 bars, flights, publish = (load(f"docs/tables/{name}") for name in ("bars", "flights", "publish"))
 ROOT = Path(__file__).parent.parent.parent

@@ -14,11 +14,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
-from magrl.agents import FieldPolicy, PolicyConfig, export_policy
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.errors import CONDITIONS, TRUE_KEYS, MagneticNorth, TargetErrors
-from magrl.evaluation.navigators import make_navigator
-from magrl.navigators import NAVIGATORS
+from magrl.navigators import NAVIGATORS, FieldPolicy, PolicyConfig, export_policy
+from magrl.navigators.names import make_navigator
 from magrl.pilot import Rules
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms import ReadingView, TrackField

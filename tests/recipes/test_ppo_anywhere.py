@@ -12,10 +12,10 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from magrl import GeomagneticNavEnv, Scenario, paper, planet_scenario
-from magrl.agents import make_correcting_actor
 from magrl.field import igrf_coefficients, random_planets
 from magrl.field.planets import gauss_moments
 from magrl.geodesy import geodesic
+from magrl.navigators import make_correcting_actor
 from magrl.pilot.network import correction_network
 from magrl.training import parse_config
 

@@ -14,10 +14,10 @@ import torch
 from torch import nn
 from torchrl.collectors import Collector
 
-from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import navigation_env
 from magrl.files import locked
+from magrl.navigators import FieldPolicy, PolicyConfig
 from magrl.training import RegionConfig, Run, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import CHANGEABLE, resumed_config

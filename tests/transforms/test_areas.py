@@ -10,9 +10,9 @@ from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import guidance
-from magrl.evaluation.navigators import make_navigator
 from magrl.geodesy import geodesic, move_place
 from magrl.named_tasks import no_go_env
+from magrl.navigators.names import make_navigator
 from magrl.transforms import NoGoAreas, TrueDisplacement
 from magrl.transforms.areas import NUMBER, distance_km, outlines, turned
 

@@ -24,14 +24,13 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, ObservationNorm, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from magrl.agents import FieldPolicy, PolicyConfig, export_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.errors import MagneticNorth, SensorErrors
 from magrl.evaluation.episodes import restart
-from magrl.evaluation.navigators import make_navigator
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move, move_place
-from magrl.navigators import Anywhere, Navigator, policy_env
+from magrl.navigators import Anywhere, FieldPolicy, Navigator, PolicyConfig, export_policy, policy_env
+from magrl.navigators.names import make_navigator
 from magrl.onboard import Command, Onboard, check_earth_jump, check_earth_reading
 from magrl.pilot import Rules
 from magrl.pilot.network import load_pilot, pretrained, save_pilot

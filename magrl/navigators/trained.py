@@ -18,13 +18,15 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, Transform
 
-from magrl.agents.networks import Device, make_actor
-from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
 from magrl.checks import check_device, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.scenario import rule_settings
 from magrl.files import write_atomically
-from magrl.navigators import Anywhere, Memory, Navigator
+from magrl.navigators.base import Navigator
+from magrl.navigators.kalman import Anywhere
+from magrl.navigators.memory import Memory
+from magrl.navigators.networks import Device, make_actor
+from magrl.navigators.onnx import OnnxNetwork, description_of, exported, with_description
 from magrl.pilot.network import save_pilot
 from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.transforms import LegsView, ObservationView, ReadingView
@@ -43,7 +45,7 @@ class PolicyConfig:
         view: what the policy observes, and its scaling: values scaled to a region, or plain readings.
         num_cells: width of each hidden layer; None for a network of another kind.
         layer_norm: whether hidden layers are normalized.
-        geometry: whether the first layer is :class:`~magrl.agents.networks.AreaGeometry`.
+        geometry: whether the first layer is :class:`~magrl.navigators.networks.AreaGeometry`.
 
     Raises:
         TypeError: for a view of another type.
@@ -196,8 +198,8 @@ def export_policy(actor: nn.Module | Path | str, view: View) -> FieldPolicy:
     Args:
         actor: network from an observation ``(N, K)`` of the view to the action in [-1, 1], ``(N, 2)``, or ``(N, 3)``
             with the declaration of the arrival: a module of PyTorch or TensorDict
-            (:func:`magrl.agents.onnx_policy.exported`), or the path of an ONNX file
-            (:class:`magrl.agents.onnx_policy.OnnxNetwork`).
+            (:func:`magrl.navigators.onnx.exported`), or the path of an ONNX file
+            (:class:`magrl.navigators.onnx.OnnxNetwork`).
         view: what it observes, and its scaling and limits.
 
     Raises:

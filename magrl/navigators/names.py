@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.agents import load_policy
-from magrl.agents.policy import TrainingSettings
 from magrl.checks import check_type, printable, short
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators import NAVIGATORS, Anywhere, Memory, Navigator
+from magrl.navigators import NAVIGATORS, Anywhere, Memory, Navigator, load_policy
+from magrl.navigators.trained import TrainingSettings
 from magrl.pilot.network import pretrained
 from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.sensor_std import PERFECT, SensorStd
