@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from benchmarks.timing import Row, alternate
-from magrl.agents import SoftUpdate, TD3Loss, optimize, saturation_penalty
 from magrl.navigators import make_actor, make_critic
+from magrl.training import SoftUpdate, TD3Loss, optimize, saturation_penalty
 
 import torch
 from tensordict import TensorDict

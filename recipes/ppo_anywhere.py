@@ -19,7 +19,6 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 from magrl import Anywhere, paper
-from magrl.agents import optimize
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.envs.scenario import rule_settings
 from magrl.errors import MotionError, SensorErrors, sensor_levels
@@ -29,7 +28,7 @@ from magrl.pilot import Rules
 from magrl.pilot.destination import RANGE_KM
 from magrl.pilot.network import correction_network
 from magrl.pilot.observation import OBSERVATION_SIZE
-from magrl.training import Run, command, parse_config
+from magrl.training import Run, command, optimize, parse_config
 from magrl.training.config import (
     Count,
     Discount,

@@ -18,12 +18,11 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from magrl import paper
-from magrl.agents import optimize
 from magrl.envs import Scenario, earth_scenario, planet_scenario
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators.memory import LIMITS, Memory, MemoryNetwork, action_of
 from magrl.navigators.networks import Spread, make_drawn_correction, make_mlp
-from magrl.training import Run, command, parse_config
+from magrl.training import Run, command, optimize, parse_config
 from magrl.training.config import Count, PlanetConfig, Positive, Widths, make_presets, read_presets
 from magrl.training.run import make_collector
 from magrl.transforms.areas import turned

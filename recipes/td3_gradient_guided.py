@@ -18,7 +18,6 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 from magrl import paper
-from magrl.agents import SoftUpdate, TD3Loss, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.envs.navigation import guidance
 from magrl.envs.scenario import rule_settings
@@ -26,7 +25,7 @@ from magrl.envs.specs import REWARD_TERMS
 from magrl.errors import SensorErrors
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import FieldPolicy, PolicyConfig, make_critic
-from magrl.training import Run, command, parse_config
+from magrl.training import Run, SoftUpdate, TD3Loss, command, optimize, parse_config, saturation_penalty
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
 from magrl.training.run import make_collector
 from magrl.transforms import DistanceCost, EpisodeSum, ProgressReward, TrueDisplacement

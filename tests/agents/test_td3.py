@@ -8,8 +8,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.objectives import TD3Loss as StockTD3Loss
 
-from magrl.agents import SoftUpdate, TD3Loss, optimize
 from magrl.navigators import make_actor, make_critic
+from magrl.training import SoftUpdate, TD3Loss, optimize
 
 CELLS = (16, 16)
 

@@ -27,7 +27,7 @@ assert "torch" not in sys.modules
 import torchrl.envs, torchrl.modules, torchrl.objectives
 
 theirs = set(sys.modules)
-from magrl import agents, envs, errors, field, navigators, transforms
+from magrl import envs, errors, field, navigators, transforms
 
 assert not {"matplotlib", "pandas", "wandb", "tqdm", "tyro"} & (set(sys.modules) - theirs), "imports are not light"
 import gymnasium

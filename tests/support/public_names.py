@@ -13,7 +13,6 @@ PACKAGES = (
     "errors",
     "envs",
     "navigators",
-    "agents",
     "onboard",
     "evaluation",
     "training",
