@@ -34,7 +34,7 @@ from magrl.envs.scenario import RULES
 from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks
+from magrl.evaluation.options import ScenarioOptions, TaskSet, choose_tasks, first_tasks
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json, write_text, write_with
 from magrl.navigators.names import NAMES, Kind, check_distinct, named, training_settings

@@ -25,13 +25,13 @@ from typing import Any, Literal
 
 import magrl
 from magrl import paper
-from magrl.benchmark import LEVELS
 from magrl.checks import CheckedModel
 from magrl.envs import PUBLIC_KEYS, earth_scenario, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, GeomagneticNavVectorEnv
 from magrl.errors import SensorErrors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
+from magrl.evaluation.tracks import LEVELS
 from magrl.navigators.names import make_navigator
 from magrl.sensor_std import Noise
 from magrl.training import UsageError, command, parse

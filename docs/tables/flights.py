@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from magrl.benchmark import TRACKS, Track
 from magrl.errors import Conditions
 from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.tables import about, mean_of_runs
+from magrl.evaluation.tracks import TRACKS, Track
 from magrl.files import check_writable, write_with
 from magrl.geodesy import geodesic, move_place, polar
 from magrl.navigators.names import named

@@ -20,9 +20,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from magrl.benchmark import COLUMNS, episode_table, write_episodes
 from magrl.evaluation import Sheet
 from magrl.evaluation.tables import markdown_table
+from magrl.evaluation.tracks import COLUMNS, episode_table, write_episodes
 from magrl.files import check_writable, read_document, read_text, write_text
 from magrl.navigators.names import check_distinct
 from magrl.training import UsageError, command

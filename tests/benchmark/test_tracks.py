@@ -15,9 +15,9 @@ import pytest
 import torch
 
 import magrl  # noqa: F401 - registers the environments
-from magrl.benchmark import SEED, TRACKS, digest
 from magrl.envs import PUBLIC_KEYS, TASK_SETS, named_tasks
 from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.tracks import SEED, TRACKS, digest
 from magrl.named_tasks import PLANET_REGIONS
 from magrl.sensor_std import STD_KEYS
 

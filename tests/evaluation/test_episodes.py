@@ -37,7 +37,7 @@ from magrl.evaluation.episodes import (
     first_episode_mask,
     moved,
 )
-from magrl.evaluation.scenarios import choose_tasks, first_tasks
+from magrl.evaluation.options import choose_tasks, first_tasks
 from magrl.navigators import FieldPolicy, PolicyConfig, Secant, policy_env
 
 

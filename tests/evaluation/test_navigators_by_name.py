@@ -11,7 +11,7 @@ from support.networks import network_file
 from torchrl.envs import StepCounter, TransformedEnv
 
 from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
-from magrl.evaluation.scenarios import choose_tasks, first_tasks
+from magrl.evaluation.options import choose_tasks, first_tasks
 from magrl.navigators import NAVIGATORS, Anywhere, FieldPolicy, PolicyConfig, load_policy, policy_env, save_policy
 from magrl.navigators.names import KINDS, PRETRAINED, check_distinct, make_navigator, named, training_settings
 from magrl.navigators.quasi_newton import probe_length

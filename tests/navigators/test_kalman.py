@@ -14,7 +14,7 @@ import magrl
 from magrl.envs import GeomagneticNavEnv
 from magrl.errors import SensorErrors
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
-from magrl.evaluation.scenarios import choose_tasks, first_tasks
+from magrl.evaluation.options import choose_tasks, first_tasks
 from magrl.navigators import Anywhere, Kalman, policy_env
 from magrl.pilot import Rules
 from magrl.pilot.network import correction_network, pretrained

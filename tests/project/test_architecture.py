@@ -77,7 +77,7 @@ def test_no_cycle_among_modules() -> None:
 # Rules of an episode, and what a vehicle knows
 
 
-OTHER_MEANINGS = {"journal.Options.arrival", "benchmark.Track.max_steps", "offline_dataset.Config.max_steps"}
+OTHER_MEANINGS = {"journal.Options.arrival", "tracks.Track.max_steps", "offline_dataset.Config.max_steps"}
 OTHER_MEANINGS |= {"fly.Config.max_steps", "fly.Config.zeta", "fly.Config.start_heading"}
 """What a vehicle alone can do, frozen tasks, and defaults that follow from a flight."""
 

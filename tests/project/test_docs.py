@@ -23,9 +23,9 @@ from support.recipes import load
 from torchrl.data import Composite
 
 import magrl
-from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.errors import CONDITIONS
+from magrl.evaluation.tracks import read_episodes
 from magrl.files import read_document
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import FieldPolicy, PolicyConfig, save_policy
@@ -157,7 +157,7 @@ def help_text(script: str) -> str:
 
 def test_help_breaks_lines_between_sentences() -> None:
     """It keeps the lines of docstrings of options."""
-    shared = (ROOT / "magrl" / name for name in ("training/config.py", "evaluation/scenarios.py"))
+    shared = (ROOT / "magrl" / name for name in ("training/config.py", "evaluation/options.py"))
     for path in (*ROOT.glob("recipes/**/*.py"), *shared):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Options")):

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from tensordict import TensorDict
 
-from magrl import benchmark
-from magrl.benchmark import COLUMNS, LEVELS, read_episodes
+from magrl.evaluation import tracks
+from magrl.evaluation.tracks import COLUMNS, LEVELS, read_episodes
 from magrl.training import UsageError
 
 
@@ -81,9 +81,9 @@ def test_a_document_may_show_some_columns_and_rows() -> None:
 
 @pytest.fixture(autouse=True)
 def few_regions(monkeypatch) -> None:
-    earth = benchmark.earth_scenario
+    earth = tracks.earth_scenario
     monkeypatch.setattr(
-        benchmark, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
+        tracks, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
     )
 
 
@@ -107,8 +107,8 @@ def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
 
 
 def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, monkeypatch) -> None:
-    few = replace(benchmark.TRACKS["vehicles-v3"], **NEAR, conditions=["ship"])
-    monkeypatch.setitem(benchmark.TRACKS, "vehicles-v3", few)
+    few = replace(tracks.TRACKS["vehicles-v3"], **NEAR, conditions=["ship"])
+    monkeypatch.setitem(tracks.TRACKS, "vehicles-v3", few)
     for confidence, ends in ((0.0, "100.0 ± 0.0 / 0.0 ± 0.0"), (1.0, "0.0 ± 0.0 / 0.0 ± 0.0")):
         grid.make(("confidence",), navigators=("geodesic",), tasks=2, confidence=confidence, out=tmp_path / "new")
         head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
@@ -155,8 +155,8 @@ def test_differences_are_of_correct_arrivals_where_cells_are() -> None:
 
 
 def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -> None:
-    few = replace(benchmark.TRACKS["north-v1"], **NEAR, levels=[(0, 0, 0), (0.05, 0.05, 5.0)])
-    monkeypatch.setitem(benchmark.TRACKS, "north-v1", few)
+    few = replace(tracks.TRACKS["north-v1"], **NEAR, levels=[(0, 0, 0), (0.05, 0.05, 5.0)])
+    monkeypatch.setitem(tracks.TRACKS, "north-v1", few)
     grid.make(("north-declared",), navigators=("secant", "geodesic"), tasks=3, out=tmp_path)
     table = rows((tmp_path / "north-declared.md").read_text(encoding="utf-8"))
     episodes = read_episodes(tmp_path / "north-declared.csv.gz")
