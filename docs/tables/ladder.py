@@ -13,7 +13,7 @@ from bars import BARS, flown
 from magrl.errors import SensorErrors
 from magrl.evaluation.scores import scored
 from magrl.evaluation.tables import markdown_table
-from magrl.field.records import weather_record
+from magrl.field.weather import weather_record
 from magrl.files import write_text
 from magrl.named_tasks import storm_errors
 from magrl.training import command

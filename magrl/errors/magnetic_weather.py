@@ -16,7 +16,7 @@ from magrl.checks import check_number, check_type
 from magrl.counters import stream_uniform
 from magrl.errors.base import ReadingErrors
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
-from magrl.field.records import WeatherRecord, weather_record
+from magrl.field.weather import WeatherRecord, weather_record
 from magrl.sensor_std import SensorStd
 from magrl.transforms.episode import Episode
 

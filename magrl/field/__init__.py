@@ -10,10 +10,10 @@ from magrl.field.model import elements_at as elements_at
 from magrl.field.model import elements_gradient_at as elements_gradient_at
 from magrl.field.model import elements_range as elements_range
 from magrl.field.planets import random_planets as random_planets
-from magrl.field.records import WEATHER as WEATHER
-from magrl.field.records import WeatherRecord as WeatherRecord
-from magrl.field.records import weather_record as weather_record
 from magrl.field.regional import RegionalField as RegionalField
 from magrl.field.spherical import SphericalHarmonicField as SphericalHarmonicField
+from magrl.field.weather import WEATHER as WEATHER
+from magrl.field.weather import WeatherRecord as WeatherRecord
+from magrl.field.weather import weather_record as weather_record
 from magrl.field.wmmhr import WMMHR as WMMHR
 from magrl.field.wmmhr import wmmhr_coefficients as wmmhr_coefficients

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from magrl.checks import check_number, check_tensor, require
-from magrl.field import harmonics
-from magrl.field.harmonics import chebyshev, chebyshev_nodes, checked_gauss
+from magrl.field import synthesis
 from magrl.field.model import Float64Module, in_chunks
 from magrl.field.regional import box_scaling, check_expansion, in_half_spans, inside_box
+from magrl.field.synthesis import chebyshev, chebyshev_nodes, checked_gauss
 from magrl.geodesy import check_box, curvature_radii, to_ecef
 
 
@@ -276,8 +276,8 @@ def _surface_weights(gauss: Tensor) -> Tensor:
     degree = gauss.shape[-1]
     angles, _ = chebyshev_nodes(degree + 12)
     axis, _, z = to_ecef(90 - torch.rad2deg(angles), torch.zeros_like(angles)).unbind(-1)
-    tables = harmonics.field_table(gauss).flatten(0, 1)
-    return harmonics.on_surface(tables, axis, z, degree).unflatten(0, (-1, 3))
+    tables = synthesis.field_table(gauss).flatten(0, 1)
+    return synthesis.on_surface(tables, axis, z, degree).unflatten(0, (-1, 3))
 
 
 def _synthesis(weights: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
@@ -297,7 +297,7 @@ def _synthesis(weights: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
     orders = (weights.flatten(1, 2) @ features).unflatten(1, (3, -1))
     odd = torch.cat((torch.arange(1, degree + 1), torch.arange(degree + 1))) % 2 == 1
     orders[:, :, odd] *= cp[:, None, None]
-    turns = harmonics.waves(cl.flatten(), sl.flatten(), torch.ones_like(cl.flatten()), degree)
+    turns = synthesis.waves(cl.flatten(), sl.flatten(), torch.ones_like(cl.flatten()), degree)
     x, y, z = (orders.mT @ turns.unflatten(1, cl.shape).movedim(1, 0).unsqueeze(1)).unbind(1)
     sp, cp, sl, cl = sp.unsqueeze(-1), cp.unsqueeze(-1), sl.unsqueeze(-2), cl.unsqueeze(-2)
     outward, east = cl * x + sl * y, cl * y - sl * x

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from magrl.checks import check_number, check_tensor
-from magrl.field.harmonics import chebyshev, chebyshev_nodes
 from magrl.field.model import FieldModel, Float64Module, in_chunks
+from magrl.field.synthesis import chebyshev, chebyshev_nodes
 from magrl.geodesy import check_box, curvature_radii
 
 

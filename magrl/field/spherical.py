@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from magrl.checks import check_number, check_tensor, require
-from magrl.field import harmonics
+from magrl.field import synthesis
 from magrl.field.model import Float64Module, in_chunks
 from magrl.geodesy import WGS84_A_KM, WGS84_E2, check_positions
 
@@ -47,14 +47,14 @@ class SphericalHarmonicField(Float64Module):
     def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0) -> None:
         super().__init__()
         check_number(altitude_km=altitude_km)
-        gauss = harmonics.checked_gauss(gauss)
+        gauss = synthesis.checked_gauss(gauss)
         self._check_altitude(torch.tensor(altitude_km, dtype=torch.float64))
         self.degree, self.altitude_km = len(gauss) - 1, float(altitude_km)
-        value, gradient = harmonics.field_table(gauss), harmonics.gradient_table(gauss)
+        value, gradient = synthesis.field_table(gauss), synthesis.gradient_table(gauss)
         padding = (0, gradient.shape[1] - value.shape[1])
         all_rows = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
         for name, table, degree in (("value", value, self.degree + 1), ("gradient", all_rows, self.degree + 2)):
-            self.register_buffer(f"{name}_weights", harmonics.separate(table, degree))
+            self.register_buffer(f"{name}_weights", synthesis.separate(table, degree))
             self.register_buffer(f"level_{name}_weights", _at_altitude(table, degree, self.altitude_km))
 
     def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:
@@ -171,8 +171,8 @@ def _sums(weights: Tensor, place: _Place, level: bool) -> Tensor:
     degree, features = weights.shape[1] // 2, weights.shape[2]
 
     def some(out: Tensor, up: Tensor, cos_lon: Tensor, sin_lon: Tensor) -> Tensor:
-        terms, lift = (harmonics.chebyshev(up, features), out) if level else harmonics.products(out, up, degree)
-        return harmonics.contract(weights, terms, harmonics.waves(cos_lon, sin_lon, lift, degree))
+        terms, lift = (synthesis.chebyshev(up, features), out) if level else synthesis.products(out, up, degree)
+        return synthesis.contract(weights, terms, synthesis.waves(cos_lon, sin_lon, lift, degree))
 
     meridian = place.cosines[0], place.sines[0]
     if not level:
@@ -190,10 +190,10 @@ def _at_altitude(table: Tensor, degree: int, altitude_km: float) -> Tensor:
 
     The ellipsoid is close to a sphere, so 12 polynomials more than the degree leave an error of 1e-9 nT on IGRF.
     """
-    angles, _ = harmonics.chebyshev_nodes(degree + 12, table.device)
+    angles, _ = synthesis.chebyshev_nodes(degree + 12, table.device)
     latitude = 90 - torch.rad2deg(angles)
     place = _place(latitude, torch.zeros_like(latitude), torch.full_like(latitude, altitude_km))
-    return harmonics.on_surface(table, place.across_km * place.cosines[0], place.z_km, degree)
+    return synthesis.on_surface(table, place.across_km * place.cosines[0], place.z_km, degree)
 
 
 def _frame_turning(b_ned: Tensor, place: _Place) -> Tensor:

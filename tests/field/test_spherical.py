@@ -13,7 +13,10 @@ from torch import Tensor
 
 from magrl.field import igrf_coefficients, random_planets
 from magrl.field.elements import measured_elements
-from magrl.field.harmonics import (
+from magrl.field.igrf import IGRF
+from magrl.field.planets import power_spectrum
+from magrl.field.spherical import SphericalHarmonicField
+from magrl.field.synthesis import (
     basis,
     chebyshev,
     chebyshev_nodes,
@@ -24,9 +27,6 @@ from magrl.field.harmonics import (
     separate,
     waves,
 )
-from magrl.field.igrf import IGRF
-from magrl.field.planets import power_spectrum
-from magrl.field.spherical import SphericalHarmonicField
 from magrl.geodesy import REFERENCE_RADIUS_KM
 
 

@@ -30,7 +30,7 @@ from magrl.errors import (
 from magrl.errors.base import TYPICAL_FIELD, ReadingErrors, true_keys
 from magrl.evaluation import Sheet, evaluation_rollout
 from magrl.field.elements import field_vector
-from magrl.field.records import weather_record
+from magrl.field.weather import weather_record
 from magrl.navigators import Secant, policy_env
 from magrl.navigators.names import make_navigator
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
