@@ -18,7 +18,7 @@ import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 from torch import Tensor
 
-from magrl.checks import UsageError
+from magrl.commands import UsageError
 
 
 class DamagedFileError(ValueError):
@@ -340,7 +340,7 @@ def locked(folder: Path) -> AcquireReturnProxy:
         ...     with locked(Path(folder)):  # doctest: +ELLIPSIS
         ...         pass
         Traceback (most recent call last):
-        magrl.checks.UsageError: another process is writing the run folder ...
+        magrl.commands.UsageError: another process is writing the run folder ...
     """
     try:
         return FileLock(folder / ".lock").acquire(timeout=0)

@@ -160,7 +160,7 @@ def readings_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """Return the environment *Readings* with errors that no data sheet states, in an aircraft (:func:`storm_errors`).
 
-    With a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`, an episode has one of 256 storms with the
+    With a seed below :data:`magrl.random_numbers.FIRST_RESERVED_SEED`, an episode has one of 256 storms with the
     spectrum of the record and random phases; with the seeds from there on, it is in the record.
 
     Args:
@@ -220,7 +220,7 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
     """
     from torchrl.envs import CatTensors, Compose, RenameTransform
 
-    from magrl.checks import UsageError
+    from magrl.commands import UsageError
     from magrl.envs.navigation import navigation_env
     from magrl.transforms import NoGoAreas, ProgressReward, SPLReward, TrueDisplacement
 

@@ -55,8 +55,3 @@ TABLE_2 = {
     "afsa": Result(77.0, 515649.380, 63.6267, 35.560),
 }
 """Published results by navigator: success rate [%], trajectory length [m], SPL [%], steps."""
-
-VALIDATION_SEED, TEST_SEED, SWEEP_SEED, PAPER_SEED = (2_000_000_011 + i for i in range(4))
-"""Seeds of frozen task sets: to choose a policy, to test it, to tune metaheuristics, and the paper's 100 tasks."""
-FIRST_RESERVED_SEED = 2_000_000_000
-"""Training refuses seeds from here on."""

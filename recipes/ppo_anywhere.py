@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from magrl import Anywhere, paper
+from magrl import Anywhere
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.envs.scenario import rule_settings
 from magrl.errors import MotionError, SensorErrors, sensor_levels
@@ -28,6 +28,7 @@ from magrl.pilot import Rules
 from magrl.pilot.destination import RANGE_KM
 from magrl.pilot.network import correction_network
 from magrl.pilot.observation import OBSERVATION_SIZE
+from magrl.random_numbers import TEST_SEED, VALIDATION_SEED
 from magrl.training import Run, command, optimize, parse_config
 from magrl.training.config import (
     Count,
@@ -178,10 +179,10 @@ def train(config: Config) -> dict[str, float]:
         options = config.rules | {"start_heading": "random", "drift_km": config.drift_km, "device": config.device}
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
-        others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)
-        validation = evaluation_env(others, config.eval_tasks_small, paper.VALIDATION_SEED, config, **options)
-        earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
-        test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, config, **options)
+        others = planet_scenario(256, seed=VALIDATION_SEED, **config.regions)
+        validation = evaluation_env(others, config.eval_tasks_small, VALIDATION_SEED, config, **options)
+        earth = earth_scenario(128, seed=TEST_SEED, **config.regions)
+        test = evaluation_env(earth, config.eval_tasks, TEST_SEED, config, **options)
         env, rules = make_env(base, config), rules_of(base, config)
 
         # Networks: only the critic reads the true displacement and the SPL that can still be reached

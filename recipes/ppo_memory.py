@@ -17,11 +17,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from magrl import paper
 from magrl.envs import Scenario, earth_scenario, planet_scenario
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators.memory import LIMITS, Memory, MemoryNetwork, action_of
 from magrl.navigators.networks import Spread, make_drawn_correction, make_mlp
+from magrl.random_numbers import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED
 from magrl.training import Run, command, optimize, parse_config
 from magrl.training.config import Count, PlanetConfig, Positive, Widths, make_presets, read_presets
 from magrl.training.run import make_collector
@@ -156,11 +156,11 @@ def train(config: Config) -> dict[str, float]:
     with Run(config, recipe=RECIPE, name=f"ppo_memory-{config.task}-{config.preset}", losses=LOSSES) as run:
         # Environments: the validation has storms of the training, not the record
         env = make_env(planet_scenario(config.num_regions, seed=config.seed, **config.regions), config)
-        others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)
-        seeds = paper.VALIDATION_SEED, paper.VALIDATION_SEED - paper.FIRST_RESERVED_SEED
+        others = planet_scenario(256, seed=VALIDATION_SEED, **config.regions)
+        seeds = VALIDATION_SEED, VALIDATION_SEED - FIRST_RESERVED_SEED
         validation = evaluation_env(others, config.eval_tasks_small, *seeds, config)
-        earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
-        test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, paper.TEST_SEED, config)
+        earth = earth_scenario(128, seed=TEST_SEED, **config.regions)
+        test = evaluation_env(earth, config.eval_tasks, TEST_SEED, TEST_SEED, config)
 
         # Networks: only the critic reads the true displacement and the SPL that can still be reached
         network, spread = MemoryNetwork(config.memory_size, config.device), Spread(config.exploration).to(env.device)

@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from magrl import Scenario, paper
+from magrl import Scenario
 from magrl.envs.gymnasium import ENV_ID
 from magrl.envs.sb3 import BatchedVecEnv
+from magrl.random_numbers import TEST_SEED
 
 import gymnasium
 import numpy as np
@@ -72,7 +73,7 @@ def make_model(config: Config) -> BaseAlgorithm:
 def evaluate(model: BaseAlgorithm, num_tasks: int) -> dict[str, float]:
     """Evaluate an agent on frozen test tasks, all in one batch; return the means of their measures."""
     scenario = Scenario()
-    scenario = scenario.with_tasks(scenario.random_tasks(num_tasks, paper.TEST_SEED))
+    scenario = scenario.with_tasks(scenario.random_tasks(num_tasks, TEST_SEED))
     envs = gymnasium.make_vec(ENV_ID, num_envs=num_tasks, scenario=scenario)
     observations, _ = envs.reset(seed=0)
     first = {name: np.full(num_tasks, np.nan) for name in ("success", "spl", "steps")}

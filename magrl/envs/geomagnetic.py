@@ -19,9 +19,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from magrl import guidance, paper
+from magrl import guidance
 from magrl.checks import check_choice, check_device, check_number, check_type
-from magrl.counters import counter_stream
 from magrl.envs import specs
 from magrl.envs.regions import Regions, one_region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
@@ -31,6 +30,7 @@ from magrl.errors.base import LEG_ERROR
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, geodesic, move, polar, wrap_angle
 from magrl.pilot.records import EpisodeRules
+from magrl.random_numbers import FIRST_RESERVED_SEED, counter_stream
 from magrl.transforms.episode import EPISODE_STREAM
 from magrl.transforms.views import ObservationView
 
@@ -133,7 +133,7 @@ class GeomagneticNavEnv(EnvBase):
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
         self._ahead: TensorDict | None = None
         self._make_specs(self.edge.reachable(self.max_leg_km + self.drift_km))
-        self.set_seed(int(torch.randint(paper.FIRST_RESERVED_SEED, ())) if seed is None else seed)
+        self.set_seed(int(torch.randint(FIRST_RESERVED_SEED, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
         """Keep the rules of a scenario, and its regions, tasks and field on the device of the batch."""

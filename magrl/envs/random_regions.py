@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_number
-from magrl.counters import counter_uniform
 from magrl.envs.regions import Regions
 from magrl.envs.scenario import Scenario
 from magrl.envs.specs import region_elements
 from magrl.field import Date, FieldBank, igrf_coefficients, parse_date, random_planets, wmmhr_coefficients
+from magrl.random_numbers import counter_uniform
 
 REGIONS_PER_PLANET = 2
 MAX_TRIES = 100

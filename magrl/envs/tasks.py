@@ -15,10 +15,10 @@ from torch import Tensor
 
 from magrl import paper
 from magrl.checks import check_choice, check_number, check_numbers, check_tensor, check_type
-from magrl.counters import counter_uniform
 from magrl.envs.regions import PAPER_REGION, Region, Regions
 from magrl.field.bank import check_index
 from magrl.geodesy import MEAN_RADIUS_KM, check_positions, geodesic, move, wrap_angle, wrap_longitude
+from magrl.random_numbers import PAPER_SEED, TEST_SEED, counter_uniform
 
 TRIES_PER_ROUND = 8
 CHUNK = 16384
@@ -274,7 +274,7 @@ def check_tasks(tasks: Tasks, within: Regions) -> Tasks:
 TASK_SETS = ("test-1000", "paper-100", "figure-4-1")
 """Frozen task sets: 1000 unseen tasks, the paper's 100, and its one task of Fig. 4-1."""
 
-RANDOM_SETS = {"test-1000": (1000, paper.TEST_SEED), "paper-100": (100, paper.PAPER_SEED)}
+RANDOM_SETS = {"test-1000": (1000, TEST_SEED), "paper-100": (100, PAPER_SEED)}
 """Number of tasks and seed of each random set."""
 
 

@@ -158,7 +158,7 @@ class ReadingErrors(EpisodeErrors):
     time: of an error that grows, it is the mean over an episode.
 
     Example:
-        >>> from magrl.counters import stream_normal
+        >>> from magrl.random_numbers import stream_normal
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from torchrl.envs import TransformedEnv
         >>> class TemperatureError(ReadingErrors):

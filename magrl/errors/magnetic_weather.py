@@ -11,12 +11,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Composite
 
-from magrl import paper
 from magrl.checks import check_number, check_type
-from magrl.counters import stream_uniform
 from magrl.errors.base import ReadingErrors
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.field.weather import WeatherRecord, weather_record
+from magrl.random_numbers import FIRST_RESERVED_SEED, stream_uniform
 from magrl.sensor_std import SensorStd
 from magrl.transforms.episode import Episode
 
@@ -45,8 +44,8 @@ class MagneticWeather(ReadingErrors):
         trip_km: distance of a trip, whose weather a vehicle expects [km].
         surrogates: number of variations with the spectrum of the record and random phases
             (:meth:`~magrl.field.WeatherRecord.surrogates`), one of which each episode of a training gets: with an
-            environment of a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`. Evaluations, with the seeds from there
-            on, get the record itself, which no training has seen.
+            environment of a seed below :data:`magrl.random_numbers.FIRST_RESERVED_SEED`. Evaluations, with the seeds
+            from there on, get the record itself, which no training has seen.
         in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last leg ``(..., K)``, whose first number is the
             distance [km].
         out_keys: the measured elements ``(..., 3)``, in place by default.
@@ -134,7 +133,7 @@ class MagneticWeather(ReadingErrors):
         """Return whether the seed of the environment, or the seeds of several, are of a training."""
         seeds = getattr(self.parent, "seed", None)
         seeds = seeds if isinstance(seeds, list) else [seeds]
-        return all(seed is not None and seed < paper.FIRST_RESERVED_SEED for seed in seeds)
+        return all(seed is not None and seed < FIRST_RESERVED_SEED for seed in seeds)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (field, leg), (start, minutes) = values, episode.numbers.unbind(-1)

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number
-from magrl.counters import NORMAL_LIMIT, normal_of, stream_normal, stream_uniform
 from magrl.errors.base import LEG_ERROR, EpisodeErrors
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
+from magrl.random_numbers import NORMAL_LIMIT, normal_of, stream_normal, stream_uniform
 from magrl.transforms.base import observed_spec
 from magrl.transforms.episode import Episode
 

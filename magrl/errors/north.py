@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from magrl.checks import check_choice, check_number
-from magrl.counters import stream_normal
 from magrl.errors.base import EpisodeErrors, ReadingErrors, gauss_markov
 from magrl.errors.magnetic_north import MagneticNorth
 from magrl.geodesy import wrap_angle, wrap_longitude
+from magrl.random_numbers import stream_normal
 from magrl.sensor_std import SensorStd
 from magrl.transforms.base import Keys
 from magrl.transforms.episode import Episode

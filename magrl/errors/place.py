@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number
-from magrl.counters import stream_normal
 from magrl.geodesy import move_place
+from magrl.random_numbers import stream_normal
 from magrl.transforms.episode import Episode, EpisodeNumbers
 from magrl.transforms.track import PLACE_KEYS
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from magrl.checks import check_number, check_tensor
-from magrl.counters import normal_of, stream_uniform
 from magrl.errors.base import ReadingErrors, build, check_sizes, gauss_markov
 from magrl.errors.vector import VectorErrors
+from magrl.random_numbers import normal_of, stream_uniform
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.transforms.episode import Episode
 

@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number
-from magrl.counters import normal_of, stream_uniform
 from magrl.errors.base import ReadingErrors, check_sizes
+from magrl.random_numbers import normal_of, stream_uniform
 from magrl.transforms.episode import Episode
 
 

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.counters import stream_normal
 from magrl.errors.base import EpisodeErrors, check_sizes, folded
+from magrl.random_numbers import stream_normal
 from magrl.transforms.base import Keys
 from magrl.transforms.episode import Episode
 

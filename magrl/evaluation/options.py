@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.scenario import RULES, rule_settings
 from magrl.envs.tasks import RANDOM_SETS
+from magrl.random_numbers import FIRST_RESERVED_SEED
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
-FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
+FIRST_TASKS_SEED = 2 * FIRST_RESERVED_SEED
 """Seed of random tasks with --tasks-seed 0: beyond the seeds of trainings and of frozen sets."""
 
 ScenarioOptions: Any = rule_settings(**dict.fromkeys((*RULES, "altitude_km")))

@@ -15,7 +15,6 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torch.utils._pytree import tree_map
 
-from magrl import paper
 from magrl.checks import check_number, short
 from magrl.envs.measures import summarize
 from magrl.evaluation.arrays import ArrayPolicy
@@ -24,8 +23,9 @@ from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.navigators import Navigator
 from magrl.navigators.names import make_navigator, named
 from magrl.navigators.onnx import OnnxNetwork, has_view
+from magrl.random_numbers import FIRST_RESERVED_SEED
 
-SEED = paper.FIRST_RESERVED_SEED + 69
+SEED = FIRST_RESERVED_SEED + 69
 """Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
 FAR_KM = 50
 """Distance from the destination beyond which the end of a success is far [km]: the longest leg of the paper."""

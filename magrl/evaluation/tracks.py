@@ -24,6 +24,7 @@ from magrl.envs import PUBLIC_KEYS, Scenario, Tasks, earth_scenario, named_tasks
 from magrl.errors import Conditions, conditions_named
 from magrl.evaluation import Flight, Sheet
 from magrl.files import write_atomically
+from magrl.random_numbers import FIRST_RESERVED_SEED
 from magrl.sensor_std import PERFECT, STD_KEYS, Noise
 
 LEVELS: tuple[Noise, ...] = (PERFECT.noise, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
@@ -32,7 +33,7 @@ VEHICLES = ("aircraft", "ship", "underwater", "low-cost")
 """Conditions of vehicles with true north."""
 DRIFT_KM = 40.0
 """How much farther than the longest leg errors may carry a vehicle [km], for one environment under all conditions."""
-SEED = 3 * paper.FIRST_RESERVED_SEED
+SEED = 3 * FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond the seeds of trainings and of frozen sets."""
 READINGS = (*PUBLIC_KEYS, "elapsed_steps")
 """Keys of the readings, without the accuracy of the sensors."""

@@ -19,11 +19,11 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.checks import check_number
-from magrl.counters import advanced, counter_stream, normal_of, stream_uniform
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import move, wrap_angle
 from magrl.navigators.base import Navigator
+from magrl.random_numbers import advanced, counter_stream, normal_of, stream_uniform
 from magrl.sensor_std import SensorStd
 from magrl.transforms.episode import EPISODE_STREAM
 
@@ -85,7 +85,7 @@ class Draws:
     """Random numbers of vehicles in one step, a pure function of their streams.
 
     Args:
-        stream: ``(N,)`` of :func:`magrl.counters.counter_stream`.
+        stream: ``(N,)`` of :func:`magrl.random_numbers.counter_stream`.
 
     Example:
         >>> draws = Draws(torch.tensor([5, 5]))

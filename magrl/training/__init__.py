@@ -1,7 +1,7 @@
 """Training: losses of TD3, configuration, run folder, resume, signals, checkpoints, curves and wandb."""
 
-from magrl.checks import UsageError as UsageError
-from magrl.checks import command as command
+from magrl.commands import UsageError as UsageError
+from magrl.commands import command as command
 from magrl.training.config import RegionConfig as RegionConfig
 from magrl.training.config import RunConfig as RunConfig
 from magrl.training.config import parse as parse

@@ -16,7 +16,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
 
-from magrl.checks import UsageError, short
+from magrl.checks import short
+from magrl.commands import UsageError
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 

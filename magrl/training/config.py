@@ -11,11 +11,12 @@ from typing import Annotated, Any, Self, TypeVar
 import tyro
 from pydantic import AfterValidator, Field, model_validator
 
-from magrl import paper
-from magrl.checks import CheckedModel, UsageError, check_choice, check_device
+from magrl.checks import CheckedModel, check_choice, check_device
+from magrl.commands import UsageError
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import RULES, rule_settings
 from magrl.files import read_document
+from magrl.random_numbers import FIRST_RESERVED_SEED
 from magrl.training.wandb_run import WandbMode
 
 Count = Annotated[int, Field(ge=1)]
@@ -25,7 +26,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Discount = Annotated[float, Field(ge=0, lt=1)]
 Widths = Annotated[tuple[Count, ...], Field(min_length=1)]
-Seed = Annotated[int, Field(ge=0, lt=paper.FIRST_RESERVED_SEED)]
+Seed = Annotated[int, Field(ge=0, lt=FIRST_RESERVED_SEED)]
 Noise = tuple[NonNegative, NonNegative, NonNegative]
 
 

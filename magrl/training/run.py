@@ -25,14 +25,15 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from magrl import paper
-from magrl.checks import UsageError, check_finite, short
+from magrl.checks import check_finite, short
+from magrl.commands import UsageError
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.envs.measures import summarize
 from magrl.errors import SensorErrors
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere, FieldPolicy, save_policy
+from magrl.random_numbers import TEST_SEED, VALIDATION_SEED
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
@@ -183,8 +184,8 @@ class Run:
             return make(len(tasks.start), scenario=self.scenario.with_tasks(tasks), **plain)
 
         if self.scenario.tasks is not None:
-            self._scenario_env = env_of(self.scenario.tasks, paper.TEST_SEED)
-        sets = (self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED)
+            self._scenario_env = env_of(self.scenario.tasks, TEST_SEED)
+        sets = (self.config.eval_tasks_small, VALIDATION_SEED), (self.config.eval_tasks, TEST_SEED)
         validation, test = (env_of(self.scenario.random_tasks(count, seed), seed) for count, seed in sets)
         return validation, test
 
@@ -340,7 +341,7 @@ class Run:
         if not self.complete:
             self._report_stop()
         rollout = evaluation_rollout(test, self.policy)
-        result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "tasks_seed": paper.TEST_SEED}
+        result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "tasks_seed": TEST_SEED}
         result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
         result["training_seconds"] = seconds
         if len(test.region) == 1:

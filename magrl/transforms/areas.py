@@ -12,8 +12,8 @@ from torch.nn.functional import pad
 from torchrl.data import Bounded, Composite
 
 from magrl.checks import check_number
-from magrl.counters import stream_uniform
 from magrl.geodesy import move_place, polar
+from magrl.random_numbers import stream_uniform
 from magrl.transforms.episode import Episode, EpisodeNumbers
 
 ALONG, ACROSS_KM = (0.2, 0.8), 80.0

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 
 from magrl.checks import check_number
-from magrl.counters import advanced, counter_stream
+from magrl.random_numbers import advanced, counter_stream
 from magrl.transforms.base import Keys, StatefulTransform
 
 EPISODE_STREAM = "episode_stream"

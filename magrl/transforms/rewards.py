@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from magrl.checks import check_number, check_numbers
-from magrl.counters import stream_uniform
 from magrl.geodesy import geodesic
+from magrl.random_numbers import stream_uniform
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward, key_list
 from magrl.transforms.episode import Episode, EpisodeNumbers
 

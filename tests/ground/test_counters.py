@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from magrl.counters import counter_uniform
+from magrl.random_numbers import counter_uniform
 
 
 @pytest.fixture(scope="module", params=[7, -1], ids="seed {}".format)

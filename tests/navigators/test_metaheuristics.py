@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from magrl import guidance
-from magrl.counters import counter_stream
 from magrl.envs import GeomagneticNavEnv, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_at
@@ -22,6 +21,7 @@ from magrl.navigators.metaheuristics import (
     reachable,
     take,
 )
+from magrl.random_numbers import counter_stream
 
 FIELD = Scenario().build_field()
 every_algorithm = pytest.mark.parametrize("name", ["afsa", "ga", "pso"])

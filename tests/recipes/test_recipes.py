@@ -24,6 +24,7 @@ from magrl import GeomagneticNavEnv, Scenario, evaluate, evaluation_rollout, loa
 from magrl.errors import SensorErrors
 from magrl.named_tasks import eddies_env, no_go_env
 from magrl.navigators import policy_env
+from magrl.random_numbers import TEST_SEED
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
 
@@ -73,7 +74,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "scenario.toml", "trajectories.png"}
     assert with_paths(whole) == []
     written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
-    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 192)
+    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, TEST_SEED, 192)
     assert written["spl"] == result["spl"]
     assert config["recipe"] == module.RECIPE
     assert tuple(config.get("noise", NOISE)) == NOISE

@@ -18,7 +18,16 @@ PACKAGES = (
     "training",
 )
 """Packages whose functions and classes are public."""
-MODULES = ("checks", "files", "geodesy", "guidance", "sensor_std", "envs.gymnasium", "navigators.metaheuristics")
+MODULES = (
+    "checks",
+    "commands",
+    "files",
+    "geodesy",
+    "guidance",
+    "sensor_std",
+    "envs.gymnasium",
+    "navigators.metaheuristics",
+)
 """Modules whose functions and classes are public."""
 
 

@@ -15,7 +15,6 @@ from torch.nn.functional import pad
 from torchrl.envs.utils import step_mdp
 
 from magrl import Anywhere, Kalman
-from magrl.counters import stream_normal
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.errors import (
     CONDITIONS,
@@ -33,6 +32,7 @@ from magrl.field.elements import field_vector
 from magrl.field.weather import weather_record
 from magrl.navigators import Secant, policy_env
 from magrl.navigators.names import make_navigator
+from magrl.random_numbers import stream_normal
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
 from magrl.transforms import TrackField
 from magrl.transforms.episode import Episode

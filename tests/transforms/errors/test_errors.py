@@ -9,12 +9,12 @@ from support.errors import STD, actions, all_errors, assert_same, every_error, f
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, SerialEnv
 
-from magrl.counters import advanced, counter_stream
 from magrl.envs.random_regions import planet_scenario
 from magrl.errors import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors, TargetErrors
 from magrl.errors.base import gauss_markov
 from magrl.geodesy import geodesic
 from magrl.named_tasks import anywhere_env
+from magrl.random_numbers import advanced, counter_stream
 from magrl.sensor_std import STD_KEYS
 
 ERRORS = {"motion_error": 0, "weather_clock": 0, "sensor_error": 6, "north_error": 0}

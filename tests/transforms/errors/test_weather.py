@@ -9,12 +9,12 @@ from support.errors import flown, nav
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from magrl import paper
 from magrl.envs import Scenario, named_tasks
 from magrl.errors import CONDITIONS, Conditions, MagneticWeather
 from magrl.evaluation import Flight
 from magrl.field import WEATHER, WeatherRecord, weather_record
 from magrl.field.elements import field_vector
+from magrl.random_numbers import FIRST_RESERVED_SEED
 
 NAN = math.nan
 SHIP = CONDITIONS["ship"].speed_km_h
@@ -178,7 +178,7 @@ def test_trainings_get_surrogates_and_evaluations_the_record() -> None:
     """By the seed of the environment, also where it is set later."""
     env, record = ship(64, surrogates=3), weather_record("disturbed")
     length = len(record.variation)
-    for seed, training in ((7, True), (paper.FIRST_RESERVED_SEED, False), (8, True)):
+    for seed, training in ((7, True), (FIRST_RESERVED_SEED, False), (8, True)):
         env.set_seed(seed)
         start = env.reset()["weather_clock"][:, 0]
         assert ((start >= length) == training).all()

@@ -13,6 +13,11 @@ from torch import Tensor
 
 from magrl.checks import check_number
 
+VALIDATION_SEED, TEST_SEED, SWEEP_SEED, PAPER_SEED = (2_000_000_011 + i for i in range(4))
+"""Seeds of frozen task sets: to choose a policy, to test it, to tune metaheuristics, and the paper's 100 tasks."""
+FIRST_RESERVED_SEED = 2_000_000_000
+"""Training refuses seeds from here on."""
+
 NORMAL_LIMIT = 4.0
 """Largest absolute value of the numbers of :func:`stream_normal`."""
 
