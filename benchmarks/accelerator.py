@@ -87,7 +87,7 @@ def training(device: torch.device, frames: int) -> str:
     sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
     recipe = importlib.import_module("td3_gradient_guided")
     with tempfile.TemporaryDirectory() as folder:
-        options = {"total_frames": frames, "eval_every": 10**6, "eval_tasks": 10, "eval_tasks_small": 10}
+        options = {"total_frames": frames, "eval_every": 10**6, "eval_trips": 10, "eval_trips_small": 10}
         config = recipe.PRESETS["fast"].replace(
             **options, wandb_mode="disabled", device=str(device), out=Path(folder) / "run"
         )

@@ -30,7 +30,7 @@ def shares(frames: int = 61_440) -> dict[str, float]:
     """Return the share of each part in the time of the training loop."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        config = recipe.Config().replace(total_frames=frames, wandb_mode="disabled", eval_tasks=10, out=out)
+        config = recipe.Config().replace(total_frames=frames, wandb_mode="disabled", eval_trips=10, out=out)
         profiler = cProfile.Profile()
         result = profiler.runcall(recipe.train, config)
     return shares_of(profiler, PARTS, result["training_seconds"])

@@ -23,7 +23,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 RECIPES = Path(__file__).parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))
 recipe = importlib.import_module("td3_gradient_guided")
-CONFIG = recipe.Config().replace(layer_norm=False, wandb_mode="disabled", eval_tasks=10, eval_tasks_small=10)
+CONFIG = recipe.Config().replace(layer_norm=False, wandb_mode="disabled", eval_trips=10, eval_trips_small=10)
 """The recipe without layer normalization, which stable-baselines3's networks lack, and with next to no evaluation."""
 
 

@@ -3,11 +3,11 @@
 from .envs import GeomagneticNavEnv as GeomagneticNavEnv
 from .envs import Region as Region
 from .envs import Scenario as Scenario
-from .envs import Tasks as Tasks
+from .envs import Trips as Trips
 from .envs import earth_scenario as earth_scenario
 from .envs import load_scenario as load_scenario
 from .envs import planet_scenario as planet_scenario
-from .envs import task_set as task_set
+from .envs import trip_set as trip_set
 from .evaluation import Flight as Flight
 from .evaluation import episode_measures as episode_measures
 from .evaluation import evaluate as evaluate

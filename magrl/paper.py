@@ -1,7 +1,7 @@
 """Facts of the paper that the library reproduces, each in one place.
 
 Source: Bai et al., *Long-distance Geomagnetic Navigation in GNSS-denied Environments with Deep Reinforcement Learning*,
-arXiv 2410.15837. The field generation, its date and the task seeds are not printed there: docs/theory.md says how they
+arXiv 2410.15837. The field generation, its date and the trip seeds are not printed there: docs/theory.md says how they
 were determined or chosen.
 """
 
@@ -10,13 +10,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 LATITUDE, LONGITUDE = (-10.0, 0.0), (160.0, 170.0)
-"""The box of the tasks [deg]."""
+"""The box of the trips [deg]."""
 DATE, GENERATION = "2022-01-01", 13
 """Date and IGRF generation that reproduce the printed field values at the two example points."""
 DISTANCE_KM = (300.0, 500.0)
 """Shortest and longest distance from start to destination [km]."""
 EXAMPLE_START, EXAMPLE_TARGET = (-2.0, 162.0), (-8.0, 164.0)
-"""The task of Fig. 4-1: latitude, longitude [deg]."""
+"""The trip of Fig. 4-1: latitude, longitude [deg]."""
 
 TABLE_1 = {
     "num_cells": (512, 512, 512),
@@ -34,7 +34,7 @@ TABLE_1 = {
 
 
 class Result(NamedTuple):
-    """A row of Table 2: means over 100 tasks.
+    """A row of Table 2: means over 100 trips.
 
     Example:
         >>> TABLE_2["gg_td3"].success_rate

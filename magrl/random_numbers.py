@@ -14,7 +14,7 @@ from torch import Tensor
 from magrl.checks import check_number
 
 VALIDATION_SEED, TEST_SEED, SWEEP_SEED, PAPER_SEED = (2_000_000_011 + i for i in range(4))
-"""Seeds of frozen task sets: to choose a policy, to test it, to tune metaheuristics, and the paper's 100 tasks."""
+"""Seeds of frozen trip sets: to choose a policy, to test it, to tune metaheuristics, and the paper's 100 trips."""
 FIRST_RESERVED_SEED = 2_000_000_000
 """Training refuses seeds from here on."""
 

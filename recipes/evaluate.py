@@ -1,9 +1,9 @@
-"""Compare navigators on the same tasks, as in Section 4.4 of the paper.
+"""Compare navigators on the same trips, as in Section 4.4 of the paper.
 
     python recipes/evaluate.py secant parallel                                  # without training
     python recipes/evaluate.py runs/A runs/B runs/C ga pso --out runs/comparison    # agents by their run folders
-    python recipes/evaluate.py secant --scenario my.toml                            # own tasks
-    python recipes/evaluate.py secant runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
+    python recipes/evaluate.py secant --scenario my.toml                            # own trips
+    python recipes/evaluate.py secant runs/A --trips 300 --trips-seed 7 --errors 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
     python recipes/evaluate.py kalman --errors 0.05 0.05 5 --north magnetic     # without a true-north reference
     python recipes/evaluate.py secant kalman --arrival distance --radius-km 25 --max-steps 80 --altitude-km -3
@@ -14,8 +14,8 @@ start heading and sensor noise are as in the training, from the file of the poli
 give its option. A line below the table names the settings that an option overrides. Metaheuristics read the field at
 the end of every candidate leg for free (an oracle).
 
-Prints the main measures. Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json,
-settings.json, table.md (all measures) and trajectories.png (the first tasks of each navigator).
+Prints the main measures. Writes episodes.csv, runs.csv, paths.csv (the paper's example trip), summary.json,
+settings.json, table.md (all measures) and trajectories.png (the first trips of each navigator).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from magrl.envs import load_scenario, named_tasks
+from magrl.envs import load_scenario, named_trips
 from magrl.envs.scenario import RULES
 from magrl.evaluation import Flight, Sheet, episode_measures, summarize
 from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.options import ScenarioOptions, TaskSet, choose_tasks, first_tasks
+from magrl.evaluation.options import ScenarioOptions, TripSet, choose_trips, first_trips
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json, write_text, write_with
 from magrl.navigators.names import NAMES, Kind, check_distinct, named, training_settings
@@ -50,7 +50,7 @@ from typing_extensions import Doc
 
 RECIPE = "evaluate.py"
 SHOWN = 24
-"""Number of tasks in trajectories.png."""
+"""Number of trips in trajectories.png."""
 FILES = "Trained agents and policies of any algorithm by run folder or file: PATH, or LABEL=PATH for one's own label."
 Pair = tuple[TensorDictModuleBase, ...]
 
@@ -66,12 +66,12 @@ class Config:
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[Annotated[tuple[str, ...], Doc(f"Navigators: {', '.join(NAMES)}. {FILES}")]]
-    tasks: TaskSet | int | None = None
-    """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
-    tasks_seed: int | None = None
-    """Seed of random tasks, disjoint from the tasks of trainings and of frozen sets; 0 by default."""
+    trips: TripSet | int | None = None
+    """Frozen trip set, or number of random trips; by default the scenario's own trips, or test-1000."""
+    trips_seed: int | None = None
+    """Seed of random trips, disjoint from the trips of trainings and of frozen sets; 0 by default."""
     scenario: Path | None = None
-    """Scenario file (.toml or .json) of region, date and tasks (docs/data.md); by default the runs' or the paper's."""
+    """Scenario file (.toml or .json) of region, date and trips (docs/data.md); by default the runs' or the paper's."""
     rules: tyro.conf.OmitArgPrefixes[ScenarioOptions] = ScenarioOptions()
     """Rules of the episodes and altitude; by default those of the scenario's file or of the trainings."""
     sheet: tyro.conf.OmitArgPrefixes[Sheet] = Sheet(errors=None, confidence=0.5)
@@ -119,7 +119,7 @@ def with_training_settings(config: Config) -> tuple[Config, list[str]]:
         own = load_scenario(config.scenario, **changes)
         chosen |= {name: own.given(name) for name in ("zeta", "start_heading")}
     settings, notes = training_settings(config.navigators, **chosen)
-    if config.tasks == "figure-4-1":  # which lies in the paper's region
+    if config.trips == "figure-4-1":  # which lies in the paper's region
         settings["scenario"] = config.scenario
     known = {"rules": config.rules.taking(settings), "sheet": config.sheet.taking(settings)}
     return replace(config, **known, **settings), notes
@@ -129,7 +129,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
     """Make environments and navigators, and the folder of the results.
 
     Returns:
-        Settings with the trainings'; flights of the tasks and of the example task; each navigator for both;
+        Settings with the trainings'; flights of the trips and of the example trip; each navigator for both;
         notes.
 
     Raises:
@@ -141,10 +141,10 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         check_distinct(config.navigators)
         config, notes = with_training_settings(config)
         changes = config.rules.model_dump(exclude_none=True)
-        scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **changes)
-        example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
+        scenario = choose_trips(config.scenario, config.trips, config.trips_seed, **changes)
+        example = first_trips(scenario, 1) if config.scenario else scenario.with_trips(named_trips("figure-4-1"))
         options = {"seed": config.seed, "device": config.device}
-        flights = [Flight(tasks, config.sheet, **options) for tasks in (scenario, example)]
+        flights = [Flight(trips, config.sheet, **options) for trips in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
@@ -174,8 +174,8 @@ def evaluate(config: Config) -> str:
         results.runs.append({"navigator": name, "run": number, "source": run, **summary})
         columns = {key: values.tolist() for key, values in measured.items()}
         results.episodes += [
-            {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
-            for task in range(flight.base.num_envs)
+            {"navigator": name, "run": number, "trip": trip, **{key: column[trip] for key, column in columns.items()}}
+            for trip in range(flight.base.num_envs)
         ]
         if number == 0:
             results.rollouts[kind.description] = rollout[:SHOWN].clone()
@@ -190,10 +190,10 @@ def settings(config: Config, flight: Flight) -> dict[str, Any]:
     given, env = map(named, config.navigators), flight.base
     return {
         "navigators": [f"{kind.name}={source.name}" if source else kind.name for kind, source, _ in given],
-        "num_tasks": env.num_envs,
-        "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
+        "num_trips": env.num_envs,
+        "trips_seed": (config.trips_seed or 0) if isinstance(config.trips, int) else None,
         "scenario": config.scenario and config.scenario.name,
-        "tasks": config.tasks,
+        "trips": config.trips,
         "seed": config.seed,
         **flight.sheet.model_dump(),
         **env.scenario.model_dump(include={*RULES, "altitude_km"}),

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 
 import places
 from magrl.checks import check_number
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Trips
 from magrl.evaluation import Flight, Sheet, episode_measures
 from magrl.evaluation.maps import trajectories_figure
 from magrl.field import IGRF
@@ -133,9 +133,9 @@ def prepare(config: Config) -> dict[str, tuple[Flight, EnvBase, Watched]]:
         field = IGRF(config.date)
         start, target, distance_km = ends(config, field)
         region = places.region_around(start, target, field, 50.0 + drift_km)
-        tasks = Tasks(start[None], target[None])
+        trips = Trips(start[None], target[None])
         size = {"region": region, "margin_deg": 0, "distance_range_km": (0.0, distance_km)}
-        scenario = Scenario(**size, field=field, tasks=tasks, date=config.date)
+        scenario = Scenario(**size, field=field, trips=trips, date=config.date)
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,

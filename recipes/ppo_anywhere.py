@@ -7,7 +7,7 @@
 
 The agent corrects the leg that dual control plans, so that it begins as the navigator `kalman`. The regions are
 patches of planets whose magnetic fields share only the spectrum and the polarity of the Earth's. The
-errors of the sensors and the price of a step are drawn for each episode. The test tasks are on Earth, in regions that
+errors of the sensors and the price of a step are drawn for each episode. The test trips are on Earth, in regions that
 no training sees. With --arrival declared, vehicles declare their arrival by the rule of `DeclareArrival`, and a false
 arrival has an SPL of 0.
 """
@@ -85,7 +85,7 @@ class Config(rule_settings("zeta", "arrival", "radius_km", "max_leg_km", "max_tu
     # Own defaults of shared settings
     total_frames: Count = 2_621_440
     num_envs: Count = 4096
-    eval_tasks_small: Count = 1000
+    eval_trips_small: Count = 1000
     gamma: Discount = 0.999
     num_regions: Count = 2048
     distance_range_km: Rising = (150.0, 1800.0)
@@ -150,10 +150,10 @@ def make_env(base: GeomagneticNavEnv, config: Config) -> TransformedEnv:
     return env
 
 
-def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config, **options: Any) -> TransformedEnv:
-    """Return an environment of random tasks of a scenario, drawn once, with the noise of the sensors."""
-    tasks = scenario.random_tasks(num_tasks, seed)
-    base = GeomagneticNavEnv(scenario.with_tasks(tasks), num_envs=num_tasks, seed=seed, **options)
+def evaluation_env(scenario: Scenario, num_trips: int, seed: int, config: Config, **options: Any) -> TransformedEnv:
+    """Return an environment of random trips of a scenario, drawn once, with the noise of the sensors."""
+    trips = scenario.random_trips(num_trips, seed)
+    base = GeomagneticNavEnv(scenario.with_trips(trips), num_envs=num_trips, seed=seed, **options)
     return TransformedEnv(base, Compose(*errors(config, seed)))
 
 
@@ -180,9 +180,9 @@ def train(config: Config) -> dict[str, float]:
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
         others = planet_scenario(256, seed=VALIDATION_SEED, **config.regions)
-        validation = evaluation_env(others, config.eval_tasks_small, VALIDATION_SEED, config, **options)
+        validation = evaluation_env(others, config.eval_trips_small, VALIDATION_SEED, config, **options)
         earth = earth_scenario(128, seed=TEST_SEED, **config.regions)
-        test = evaluation_env(earth, config.eval_tasks, TEST_SEED, config, **options)
+        test = evaluation_env(earth, config.eval_trips, TEST_SEED, config, **options)
         env, rules = make_env(base, config), rules_of(base, config)
 
         # Networks: only the critic reads the true displacement and the SPL that can still be reached

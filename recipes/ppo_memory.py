@@ -8,7 +8,7 @@
 
 The agent observes what its sensors measure and its own legs, step by step. A gated recurrent unit (GRU) estimates the
 displacement to the destination, and is trained to predict the true one. PPO learns the legs, given the memory, as
-corrections of that estimate. The test tasks are on Earth, in regions that no training sees. On *Storm* their weather is
+corrections of that estimate. The test trips are on Earth, in regions that no training sees. On *Storm* their weather is
 the record, which no training sees either.
 """
 
@@ -65,7 +65,7 @@ class Config(PlanetConfig):
     gamma: float = 0.99
     exploration: Positive = 0.3
     critic_cells: Widths = (128, 128)
-    eval_tasks_small: Count = 500
+    eval_trips_small: Count = 500
 
     step_price: Positive = 0.5
     """Price of a step in the reward [% of SPL]."""
@@ -98,10 +98,10 @@ def task_env(scenario: Scenario, config: Config, **options: Any) -> TransformedE
     return make(scenario=scenario, max_steps=config.max_steps, device=config.device, **options)
 
 
-def evaluation_env(scenario: Scenario, num_tasks: int, tasks_seed: int, seed: int, config: Config) -> EnvBase:
-    """Return an environment of random tasks of a scenario, drawn once, in physical units."""
-    tasks = scenario.with_tasks(scenario.random_tasks(num_tasks, tasks_seed))
-    return task_env(tasks, config, num_envs=num_tasks, seed=seed, observation="dict", scale_actions=False)
+def evaluation_env(scenario: Scenario, num_trips: int, trips_seed: int, seed: int, config: Config) -> EnvBase:
+    """Return an environment of random trips of a scenario, drawn once, in physical units."""
+    trips = scenario.with_trips(scenario.random_trips(num_trips, trips_seed))
+    return task_env(trips, config, num_envs=num_trips, seed=seed, observation="dict", scale_actions=False)
 
 
 def accuracy_range(seen: TensorDictBase) -> list[list[float]]:
@@ -158,9 +158,9 @@ def train(config: Config) -> dict[str, float]:
         env = make_env(planet_scenario(config.num_regions, seed=config.seed, **config.regions), config)
         others = planet_scenario(256, seed=VALIDATION_SEED, **config.regions)
         seeds = VALIDATION_SEED, VALIDATION_SEED - FIRST_RESERVED_SEED
-        validation = evaluation_env(others, config.eval_tasks_small, *seeds, config)
+        validation = evaluation_env(others, config.eval_trips_small, *seeds, config)
         earth = earth_scenario(128, seed=TEST_SEED, **config.regions)
-        test = evaluation_env(earth, config.eval_tasks, TEST_SEED, TEST_SEED, config)
+        test = evaluation_env(earth, config.eval_trips, TEST_SEED, TEST_SEED, config)
 
         # Networks: only the critic reads the true displacement and the SPL that can still be reached
         network, spread = MemoryNetwork(config.memory_size, config.device), Spread(config.exploration).to(env.device)

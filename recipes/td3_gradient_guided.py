@@ -184,7 +184,7 @@ def train(config: Config) -> dict[str, float]:
     name += f"-{config.task}" if config.task != PRESETS[config.preset].task else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        env, reward = make_env(run.scenario.with_tasks(None), config), partial(rewards, config=config)
+        env, reward = make_env(run.scenario.with_trips(None), config), partial(rewards, config=config)
         validation, test = run.evaluation_envs(NAMED_TASKS[config.task].make, reward=reward, **config.options)
 
         # Networks

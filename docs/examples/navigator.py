@@ -52,6 +52,6 @@ class SimpleSecant(Navigator):
 
 
 scenario = Scenario()
-env = GeomagneticNavEnv(scenario.with_tasks(scenario.random_tasks(100, seed=7)), num_envs=100)
+env = GeomagneticNavEnv(scenario.with_trips(scenario.random_trips(100, seed=7)), num_envs=100)
 summary = summarize(episode_measures(evaluation_rollout(env, SimpleSecant())))
 print(f"SR {summary['success_rate']:.1f} %, SPL {summary['spl']:.1f} %")

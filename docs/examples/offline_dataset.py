@@ -6,7 +6,7 @@
 
 Takes two minutes on one core, and needs the extra `minari`. There is one dataset for each policy and level of white
 noise, such as `magrl/earth-kalman-0_05-v0`, where the standard deviation of D is 0.05 deg. At one level, all policies
-fly the same tasks with the same errors, in random regions of the Earth or of random planets, with an arrival signal.
+fly the same trips with the same errors, in random regions of the Earth or of random planets, with an arrival signal.
 Observations are `field`, `target_field`, `leg` and `heading`; actions are distance [km] and turn [rad]; the reward is
 `SPLReward`. The metadata holds mean returns as references (`ref_min_score` of random actions, `ref_max_score` of
 `kalman`), the command, and the call that makes the environment: after `reset(seed=seed)` with the seed of an episode,
@@ -60,7 +60,7 @@ class Config(CheckedModel):
     max_steps: Count = 50
     """Legs after which an episode is truncated."""
     seed: Seed = 0
-    """Random seed of regions, tasks, start headings, noise and random actions, below those of evaluations."""
+    """Random seed of regions, trips, start headings, noise and random actions, below those of evaluations."""
     out: Path = Path("runs/minari")
     """Folder of Minari datasets, MINARI_DATASETS_PATH of their readers; datasets in it are not replaced."""
 

@@ -4,7 +4,7 @@
     python docs/examples/sb3.py                       # PPO, 330 000 steps
     python docs/examples/sb3.py --algorithm sac --num-envs 64 --total-timesteps 51200
 
-Prints success rate, SPL (success weighted by path length) and steps on 100 test tasks. Takes one to two minutes.
+Prints success rate, SPL (success weighted by path length) and steps on 100 test trips. Takes one to two minutes.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Config:
     """Gradient steps after each step of all vehicles, of SAC and TD3."""
     learning_rate: float = 1e-3
     """Learning rate of Adam."""
-    eval_tasks: int = 100
-    """Number of test tasks of the final evaluation."""
+    eval_trips: int = 100
+    """Number of test trips of the final evaluation."""
     seed: int = 0
-    """Random seed of weights, exploration and tasks."""
+    """Random seed of weights, exploration and trips."""
 
 
 def make_model(config: Config) -> BaseAlgorithm:
@@ -70,13 +70,13 @@ def make_model(config: Config) -> BaseAlgorithm:
     return {"sac": SAC, "td3": TD3}[config.algorithm]("MlpPolicy", envs, **settings)
 
 
-def evaluate(model: BaseAlgorithm, num_tasks: int) -> dict[str, float]:
-    """Evaluate an agent on frozen test tasks, all in one batch; return the means of their measures."""
+def evaluate(model: BaseAlgorithm, num_trips: int) -> dict[str, float]:
+    """Evaluate an agent on frozen test trips, all in one batch; return the means of their measures."""
     scenario = Scenario()
-    scenario = scenario.with_tasks(scenario.random_tasks(num_tasks, TEST_SEED))
-    envs = gymnasium.make_vec(ENV_ID, num_envs=num_tasks, scenario=scenario)
+    scenario = scenario.with_trips(scenario.random_trips(num_trips, TEST_SEED))
+    envs = gymnasium.make_vec(ENV_ID, num_envs=num_trips, scenario=scenario)
     observations, _ = envs.reset(seed=0)
-    first = {name: np.full(num_tasks, np.nan) for name in ("success", "spl", "steps")}
+    first = {name: np.full(num_trips, np.nan) for name in ("success", "spl", "steps")}
     while np.isnan(first["success"]).any():
         actions, _ = model.predict(observations, deterministic=True)
         observations, *_, info = envs.step(actions)
@@ -91,7 +91,7 @@ def main(config: Config) -> dict[str, float]:
     """Train and evaluate."""
     model = make_model(config)
     model.learn(config.total_timesteps)
-    result = evaluate(model, config.eval_tasks)
+    result = evaluate(model, config.eval_trips)
     print(", ".join(f"{name} {value:.3f}" for name, value in result.items()))
     return result
 

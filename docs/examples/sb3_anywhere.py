@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-total_timesteps, num_tasks = 400_000, 500
+total_timesteps, num_trips = 400_000, 500
 
 # Training on random planets, with random noise of the sensors
 name, reward = "magrl/GeomagneticNavigationAnywhere-v1", "spl"
@@ -37,9 +37,9 @@ def act(observation: Tensor) -> Tensor:
 
 # Evaluation on Earth
 earth = earth_scenario(64, seed=1, distance_range_km=(300, 500), start_heading="random")
-earth = earth.with_tasks(earth.random_tasks(num_tasks, seed=2))
+earth = earth.with_trips(earth.random_trips(num_trips, seed=2))
 noise = (0.05, 0.05, 5.0)
-env = anywhere_env(num_tasks, scenario=earth, transforms=[SensorErrors(noise)])
+env = anywhere_env(num_trips, scenario=earth, transforms=[SensorErrors(noise)])
 rollout = evaluation_rollout(env, TensorDictModule(act, ["observation"], ["action"]))
 rows = {"PPO of stable-baselines3": [summarize(episode_measures(rollout))]}
 rows |= {name: [summarize(evaluate(name, earth, errors=noise))] for name in ("anywhere", "kalman")}

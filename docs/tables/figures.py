@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
+from magrl.envs import PAPER_REGION, Region, Scenario, named_trips
 from magrl.envs.rendering import draw_tracks
 from magrl.errors import Conditions, load_conditions
 from magrl.evaluation import Flight, evaluation_rollout
@@ -44,8 +44,8 @@ FILE = Path(__file__).parent / "figures.toml"
 Figures = Mapping[str, Figure | DataFrame]
 """Figures by file, from the folder of the documentation, after the data that they are drawn from."""
 CURVES = {
-    "results/fig-4-2-reward": ("eval_return", "return on the validation tasks, without alignment"),
-    "results/fig-4-3-success": ("eval_success_rate", "success rate on the validation tasks [%]"),
+    "results/fig-4-2-reward": ("eval_return", "return on the validation trips, without alignment"),
+    "results/fig-4-3-success": ("eval_success_rate", "success rate on the validation trips [%]"),
 }
 """Column and label of learning curves."""
 DATA = dict.fromkeys(CURVES, "results/learning.csv")
@@ -74,16 +74,16 @@ def columns_by_navigator(path: Path) -> dict[str, dict[str, list[float]]]:
 
 
 def section_4() -> Figures:
-    """Return the field over the region, the example task of each navigator, and box plots."""
+    """Return the field over the region, the example trip of each navigator, and box plots."""
     contours = Figure(figsize=(7, 7.4), layout="constrained")
-    field, task = Scenario().build_field(), named_tasks("figure-4-1")
-    draw_tracks(contours.subplots(), field, PAPER_REGION, [task.start], task.target)
+    field, trip = Scenario().build_field(), named_trips("figure-4-1")
+    draw_tracks(contours.subplots(), field, PAPER_REGION, [trip.start], trip.target)
     paths, episodes = (columns_by_navigator(RUNS / "comparison" / f"{name}.csv") for name in ("paths", "episodes"))
     tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
     return {
         "figures/fig-4-1-contours": contours,
-        "figures/fig-4-4-trajectories": plots.compared_trajectories(tracks, field, task),
-        "results/fig-4-5-convergence": plots.convergence(paths, field, task),
+        "figures/fig-4-4-trajectories": plots.compared_trajectories(tracks, field, trip),
+        "results/fig-4-5-convergence": plots.convergence(paths, field, trip),
         "results/fig-4-6-boxes": plots.box_plots(episodes),
     }
 
@@ -91,7 +91,7 @@ def section_4() -> Figures:
 def learning() -> Figures:
     """Return the learning curves of the runs in figures.toml, and their data.
 
-    Both are of the validation tasks, without exploration, and the return is of the terms that all agents share. Of
+    Both are of the validation trips, without exploration, and the return is of the terms that all agents share. Of
     training episodes, those of all vehicles that fail end together, every 50 steps.
     """
     runs = [
@@ -129,12 +129,12 @@ def one_error(lines: str, size: object = "") -> Conditions:
         return load_conditions(path)
 
 
-def conditions(tasks: int = 300) -> Figures:
+def conditions(trips: int = 300) -> Figures:
     """Return a panel for each error, SPL over its size for each navigator, and their data.
 
     Everything else is as at the noise alone, which is the first point of each panel.
     """
-    flights, rows = Flights(["ship"], tasks=tasks), []  # its environment lets errors move vehicles
+    flights, rows = Flights(["ship"], trips=trips), []  # its environment lets errors move vehicles
     for navigator in tqdm(MARKERS, unit="navigator"):
         alone = mean_spl(flights, navigator, one_error(""))
         for title, error in declared(FILE)["errors"].items():
@@ -149,7 +149,7 @@ def conditions(tasks: int = 300) -> Figures:
 def mean_spl(flights: Flights, navigator: str, errors: Conditions) -> tuple[float, float]:
     """Return the mean SPL [%] and the half-width of its 95 % interval, clustered by region."""
     (episodes,) = flights.episodes(navigator, errors)
-    return clustered(100 * episodes["spl"].double(), flights.scenario.tasks.region)
+    return clustered(100 * episodes["spl"].double(), flights.scenario.trips.region)
 
 
 def error_panels(data: DataFrame) -> Figure:
@@ -168,7 +168,7 @@ def error_panels(data: DataFrame) -> Figure:
     return figure
 
 
-def reliability_diagram(tasks: int = 2000) -> Figures:
+def reliability_diagram(trips: int = 2000) -> Figures:
     """Return the share of readings at which `anywhere` is within 25 km, over the probability that it states.
 
     One panel is for white noise, one for the errors of vehicles; bars are intervals of 95 %, clustered by region.
@@ -176,10 +176,10 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
     figure, rows = Figure(figsize=(9, 4.6), layout="constrained"), []
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, names in zip(panels, ((), ("aircraft", "ship", "underwater", "low-cost")), strict=True):
-        flights = Flights(names, tasks=tasks, regions=min(tasks, 512), max_steps=80, within_km=25.0)
+        flights = Flights(names, trips=trips, regions=min(trips, 512), max_steps=80, within_km=25.0)
         axes.axline((0, 0), (100, 100), color="#808080", lw=1, ls="--")
         for (name, errors), like in zip(flights.errors.items(), MARKERS, strict=False):
-            bins = reliability(flights.fly("anywhere", errors), flights.scenario.tasks.region, 25.0)
+            bins = reliability(flights.fly("anywhere", errors), flights.scenario.trips.region, 25.0)
             axes.errorbar(*zip(*bins, strict=True), **look(like) | {"label": name})
             rows += [(name, *one) for one in bins]
         axes.set_xlabel("stated probability [%]")
@@ -189,7 +189,7 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
     return {"results/reliability": data, "figures/reliability": figure}
 
 
-def place_error(tasks: int = 64) -> Figures:
+def place_error(trips: int = 64) -> Figures:
     """Return the median error of the place over 3000 km: of dead reckoning, and of a belief with IGRF-13 beside it.
 
     Bands hold the middle half of the flights. Vehicles follow their dead reckoning; the start is known to 5 km.
@@ -198,7 +198,7 @@ def place_error(tasks: int = 64) -> Figures:
     told = {"model": "IGRF-13", "start_km": 5.0}
     box = {"region": Region((-40, 60), (-50, 50)), "margin_deg": 10, "distance_range_km": (2950.0, 3050.0)}
     sea = Scenario(**box, field=IGRF("2025-01-01"), date="2025-01-01", start_heading="random", max_steps=80)
-    sea = sea.with_tasks(sea.random_tasks(tasks, 5))
+    sea = sea.with_trips(sea.random_trips(trips, 5))
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     for axes, name in zip(panels, ("ship", "underwater", "low-cost"), strict=True):
         flight = Flight(sea, errors=name, arrival="declared", **told)
@@ -248,12 +248,12 @@ FIGURES: Mapping[str, Callable[..., Figures]] = {
 }
 
 
-def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = None, out: Path = Path("docs")) -> None:
+def draw(figures: tyro.conf.Positional[tuple[str, ...]], trips: int | None = None, out: Path = Path("docs")) -> None:
     """Draw figures.
 
     Args:
         figures: Names of figures.
-        tasks: Number of tasks of new flights; by default 64 to 2000, by figure.
+        trips: Number of trips of new flights; by default 64 to 2000, by figure.
         out: Folder of the folders figures and results; files of the same name are replaced.
 
     Raises:
@@ -261,7 +261,7 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
     """
     if unknown := [name for name in figures if name not in FIGURES] or not figures:
         raise UsageError(f"unknown figure {unknown}: choose from {', '.join(FIGURES)}")
-    options = {"tasks": tasks} if tasks else {}
+    options = {"trips": trips} if trips else {}
     try:
         for name in figures:
             for file, made in FIGURES[name](**options).items():

@@ -1,4 +1,4 @@
-"""Flights of tables and figures: frozen tasks in random regions, navigators that know the accuracy of their sensors."""
+"""Flights of tables and figures: frozen trips in random regions, navigators that know the accuracy of their sensors."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ class Flights(Track):
         return cls(**asdict(base) | {"sheet": base.sheet.taking(options)} | options)
 
     def fly(self, navigator: Spec, errors: Errors, device: str = "cpu") -> TensorDictBase:
-        """Return an episode of each task."""
+        """Return an episode of each trip."""
         own = options_of(navigator)
         return flown(self.flight(errors, sheet=self.sheet.taking(own), device=device), own)
 
     def episodes(self, navigator: Spec, errors: Errors, device: str = "cpu") -> list[Measures]:
-        """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
+        """Return the measures of an episode of each trip, once for each run that the pattern of a navigator names."""
         return [episode_measures(self.fly(run, errors, device)) for run in runs_of(navigator)]
 
     def summaries(self, navigator: Spec, errors: Errors) -> list[dict[str, float]]:
@@ -95,7 +95,7 @@ def clustered(values: Tensor, region: Tensor) -> tuple[float, float]:
 
 
 def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:
-    """Return the mean difference of two shares ``(N,)`` of the same tasks, in percent, with an interval of 95 %.
+    """Return the mean difference of two shares ``(N,)`` of the same trips, in percent, with an interval of 95 %.
 
     An interval that excludes 0 is bold.
     """

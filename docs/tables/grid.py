@@ -1,8 +1,8 @@
-"""Make the tables that docs/tables/tables.toml declares: navigators by errors, tasks and runs.
+"""Make the tables that docs/tables/tables.toml declares: navigators by errors, trips and runs.
 
     python docs/tables/grid.py earth known --out docs/results  # writes earth.md, earth.csv.gz, ...
     python docs/tables/grid.py earth --navigators mine.onnx    # the same table of other navigators
-    python docs/tables/grid.py earth --tasks 200               # faster
+    python docs/tables/grid.py earth --trips 200               # faster
 
 Without --out, tables are printed. Navigators are given the accuracy of their sensors. Tables of trained agents read
 the run folders that they name; `make tables` trains what is missing.
@@ -58,7 +58,7 @@ def flights(
     """
     made, rows, shares, tables = Flights.of(**options), [], {}, []
     share, measure = ("spl", "SPL") if "spl" in measures else ("success", "correct arrivals")
-    region = made.scenario.tasks.region
+    region = made.scenario.trips.region
     known = [names(navigator, made.sheet) for navigator in navigators]
     titles = titles_of(ABOUT, known)
     cells = mapped(
@@ -108,7 +108,7 @@ def make(
     tables: tyro.conf.Positional[tuple[str, ...]] = (),
     *,
     navigators: tuple[str, ...] | None = None,
-    tasks: int | None = None,
+    trips: int | None = None,
     confidence: float | None = None,
     jobs: int | None = None,
     backend: Backend | None = None,
@@ -120,7 +120,7 @@ def make(
     Args:
         tables: Names of tables in tables.toml; all by default.
         navigators: Navigators, as in recipes/evaluate.py; by default from tables.toml.
-        tasks: Number of tasks; by default from tables.toml.
+        trips: Number of trips; by default from tables.toml.
         confidence: Minimum probability at which vehicles declare their arrival; by default from tables.toml.
         jobs: Processes that fly, with one thread each; of tables of the kind flights.
         backend: Where they are: loky on this machine, ray on a cluster.
@@ -130,7 +130,7 @@ def make(
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
-    specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence}
+    specs, changes = declared(), {"navigators": navigators, "trips": trips, "confidence": confidence}
     changes |= {"jobs": jobs, "backend": backend, "device": device}
     changes = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in tables if name not in specs]:

@@ -2,7 +2,7 @@
 
     python docs/tables/pictures.py    # docs/figures/underwater.gif, eddies.png and task-*.png; three minutes
 
-The flights of the animation are two cells of the table known-1200: 300 tasks by dead reckoning and by kalman, which has
+The flights of the animation are two cells of the table known-1200: 300 trips by dead reckoning and by kalman, which has
 elements measured at the destination and declares at once, of which it shows one that dead reckoning misses.
 """
 
@@ -47,7 +47,7 @@ from bars import TASKS, flown
 from flights import Flights, believed_places
 
 SHOWN, WITHIN_KM = 212, 25.0
-"""Task of the animation, chosen in the open sea with a coast in sight, and the radius of arrival."""
+"""Trip of the animation, chosen in the open sea with a coast in sight, and the radius of arrival."""
 FIELD = IGRF("2025-01-01")
 GRAY, BLUE, VERMILION = "#707070", "#0072B2", "#D55E00"
 KM_PER_DEG, ROOM_KM = 111.2, 30.0
@@ -59,7 +59,7 @@ COLORS, VEHICLES, EDDY_EPISODE = 256, 16, 4
 """Colors of a map, vehicles of a rollout, episode of *Eddies*, in which the true bearing fails."""
 
 
-class Trip(NamedTuple):
+class Voyage(NamedTuple):
     """A flight at the start and after each step: true and believed places ``(T + 1, 2)`` [deg], and the covariance of
     the belief ``(T + 1, 2, 2)`` [km^2]."""
 
@@ -73,26 +73,26 @@ class Trip(NamedTuple):
         return apart_km(self.true[-1], self.believed[-1])
 
     @classmethod
-    def of(cls, steps: TensorDictBase, belief: str) -> Trip:
-        """Return the trip of an episode ``(T,)`` by one of :func:`believed_places`."""
+    def of(cls, steps: TensorDictBase, belief: str) -> Voyage:
+        """Return the voyage of an episode ``(T,)`` by one of :func:`believed_places`."""
         steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
         places = believed_places(steps["next"][None])[belief][0]
         key = "track", "displacement", "covariance"
         pairs = ("position", steps["next", "position"]), ("start_place", places), (key, steps["next", *key])
         return cls(*(torch.cat((steps[name][:1], after)).double() for name, after in pairs))
 
-    def at(self, time: float) -> Trip:
-        """Return the trip up to a time in steps; after its end, all of it."""
+    def at(self, time: float) -> Voyage:
+        """Return the voyage up to a time in steps; after its end, all of it."""
         step, last = int(time), len(self.true) - 1
         if time >= last:
             return self
-        return Trip(
+        return Voyage(
             *(torch.cat((part[: step + 1], torch.lerp(*part[step : step + 2], time % 1)[None])) for part in self)
         )
 
 
-def trips(shown: int = SHOWN) -> tuple[Tensor, dict[str, tuple[Trip, float]]]:
-    """Return the destination of the task that is shown, and trip and arrivals [%] of each navigator."""
+def voyages(shown: int = SHOWN) -> tuple[Tensor, dict[str, tuple[Voyage, float]]]:
+    """Return the destination of the trip that is shown, and voyage and arrivals [%] of each navigator."""
     table = tomllib.loads(read_text(Path(__file__).with_name("tables.toml")))["known-1200"]
     far = Flights.of(**{key: table[key] for key in table if key not in ("kind", "measures", "navigators", "against")})
     made, known, measured = {}, {"model": "IGRF-13", "start_km": 5.0}, far.sheet.target_std
@@ -100,21 +100,21 @@ def trips(shown: int = SHOWN) -> tuple[Tensor, dict[str, tuple[Trip, float]]]:
         flight = far.flight(far.errors["underwater"], **known, confidence=0.0, target_std=std)
         navigator = flight.navigator(name)
         steps = evaluation_rollout(flight.env_of(navigator, track=True), navigator)
-        made[name] = Trip.of(steps[shown], belief), 100 * episode_measures(steps)["success"].double().mean().item()
+        made[name] = Voyage.of(steps[shown], belief), 100 * episode_measures(steps)["success"].double().mean().item()
     return steps[shown, 0]["target_position"].double(), made
 
 
 class Animation:
-    """Two trips on a map, drawn at any time.
+    """Two voyages on a map, drawn at any time.
 
     Args:
         target: destination ``(2,)`` [deg].
-        reckoning: trip of dead reckoning.
-        filtered: trip of kalman.
+        reckoning: voyage of dead reckoning.
+        filtered: voyage of kalman.
     """
 
-    def __init__(self, target: Tensor, reckoning: Trip, filtered: Trip) -> None:
-        self.target, self.trips = target, (reckoning, filtered)
+    def __init__(self, target: Tensor, reckoning: Voyage, filtered: Voyage) -> None:
+        self.target, self.voyages = target, (reckoning, filtered)
         self.figure = Figure(figsize=(7.2, 7.4), dpi=100)
         axes = self.figure.add_axes((0.01, 0.13, 0.98, 0.79))
         draw_map(axes, FIELD, torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None])))
@@ -138,13 +138,13 @@ class Animation:
 
     def image(self, time: float, verdict: str = "") -> Image.Image:
         """Return the map at a time in steps, with a text above the paths."""
-        here, there = (trip.at(time) for trip in self.trips)
+        here, there = (voyage.at(time) for voyage in self.voyages)
         for line, places in zip(self.lines, (here.believed, here.true, there.true), strict=True):
             line.set_data(*places.T.flip(0))
         ellipse = displacement_ellipse(there.believed[-1], torch.zeros(2), there.covariance[-1])
         self.ellipse.set_xy(ellipse.flip(-1))
-        before = [trip.at(int(time)) for trip in self.trips]
-        error, other = (f"{trip.error_km:.0f} km" for trip in before)
+        before = [voyage.at(int(time)) for voyage in self.voyages]
+        error, other = (f"{voyage.error_km:.0f} km" for voyage in before)
         left = apart_km(before[1].true[-1], self.target)
         shown = (f"step {int(time)} · {left:.0f} km to go · error", error, "/", other)
         for text, content in zip(self.texts, shown, strict=True):
@@ -156,8 +156,8 @@ class Animation:
 
     def frames(self, verdict: str) -> Iterator[Image.Image]:
         """Yield images at most :data:`PIECE_KM` apart, and the verdict."""
-        for step in range(len(self.trips[1].true) - 1):
-            legs = [apart_km(*(trip.at(end).true[-1] for end in (step, step + 1))) for trip in self.trips]
+        for step in range(len(self.voyages[1].true) - 1):
+            legs = [apart_km(*(voyage.at(end).true[-1] for end in (step, step + 1))) for voyage in self.voyages]
             pieces = max(1, math.ceil(max(legs) / PIECE_KM))
             yield from (self.image(step + piece / pieces) for piece in range(pieces))
         yield self.image(step + 1)
@@ -292,7 +292,7 @@ def main(out: Path = Path("docs/figures")) -> None:
     Args:
         out: Folder of the pictures, which are replaced.
     """
-    target, flights = trips()
+    target, flights = voyages()
     (reckoning, few), (filtered, many) = flights.values()
     frames = Animation(target, reckoning, filtered).frames(
         f"dead reckoning {few:.0f} of 100,\nmagrl {many:.0f} of 100 arrive"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from magrl.envs import Region, Tasks
+from magrl.envs import Region, Trips
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
 from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
@@ -79,54 +79,54 @@ def learning_curves(
 
 
 def compared_trajectories(
-    tracks: Mapping[str, tuple[Sequence[float], Sequence[float]]], field: FieldModel, task: Tasks
+    tracks: Mapping[str, tuple[Sequence[float], Sequence[float]]], field: FieldModel, trip: Trips
 ) -> Figure:
-    """Return a map of the paths of several navigators on one task, over the field's contours (Fig. 4-4).
+    """Return a map of the paths of several navigators on one trip, over the field's contours (Fig. 4-4).
 
     Args:
         tracks: by navigator, latitudes and longitudes of its waypoints [deg].
         field: any model of :mod:`magrl.field`.
-        task: one task.
+        trip: one trip.
 
     Example:
         >>> from magrl.field.igrf import IGRF
-        >>> from magrl.envs.tasks import named_tasks
+        >>> from magrl.envs.trips import named_trips
         >>> track = ([-2.0, -8.0], [162.0, 164.0])
-        >>> figure = compared_trajectories({"secant": track}, IGRF("2022-01-01"), named_tasks("figure-4-1"))
+        >>> figure = compared_trajectories({"secant": track}, IGRF("2022-01-01"), named_trips("figure-4-1"))
         >>> figure.axes[0].lines[-1].get_label()
         'destination'
     """
     figure = Figure(figsize=(8, 8.4), layout="constrained")
     axes = figure.subplots()
     points = torch.tensor([[lat, lon] for track in tracks.values() for lat, lon in zip(*track, strict=True)])
-    points = torch.cat((points, task.start, task.target))
+    points = torch.cat((points, trip.start, trip.target))
     low, high = (points.amin(0) - 0.5).tolist(), (points.amax(0) + 0.5).tolist()
     draw_contours(axes, field, Region((low[0], high[0]), (low[1], high[1])))
     for name, (latitude, longitude) in tracks.items():
         axes.plot(longitude, latitude, "o-", ms=3, lw=1.5, **_look(name))
-    axes.plot(*task.start.flip(-1).T, "s", color=START, ms=8, label="start")
-    axes.plot(*task.target.flip(-1).T, "^", color=TARGET, ms=9, label="destination")
+    axes.plot(*trip.start.flip(-1).T, "s", color=START, ms=8, label="start")
+    axes.plot(*trip.target.flip(-1).T, "^", color=TARGET, ms=9, label="destination")
     axes.legend(fontsize=8, loc="best")
     return figure
 
 
-def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: FieldModel, task: Tasks) -> Figure:
+def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: FieldModel, trip: Trips) -> Figure:
     """Return D, I, B_H and the length of legs against the step (Fig. 4-5 a to d).
 
     Args:
         series: by navigator, values of ``D``, ``I``, ``B_H`` and ``L`` at each step, the start first.
         field: any model of :mod:`magrl.field`, for the target's values.
-        task: the task of all navigators.
+        trip: the trip of all navigators.
 
     Example:
         >>> from magrl.field.igrf import IGRF
-        >>> from magrl.envs.tasks import named_tasks
+        >>> from magrl.envs.trips import named_trips
         >>> values = {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0], "L": [0.0, 50.0]}
-        >>> figure = convergence({"secant": values}, IGRF("2022-01-01"), named_tasks("figure-4-1"))
+        >>> figure = convergence({"secant": values}, IGRF("2022-01-01"), named_trips("figure-4-1"))
         >>> [axes.get_title() for axes in figure.axes]
         ['(a)', '(b)', '(c)', '(d)']
     """
-    targets = dict(zip(NAMES, elements_at(field, task.target[0]).tolist(), strict=True))
+    targets = dict(zip(NAMES, elements_at(field, trip.target[0]).tolist(), strict=True))
     labels = {name: f"{SYMBOLS[name]} [{unit}]" for name, unit in zip(NAMES, UNITS, strict=True)}
     labels["L"] = "length of the leg [km]"
     figure, panels = _four_panels(labels)

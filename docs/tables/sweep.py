@@ -152,7 +152,7 @@ def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
 
 
 def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
-    """Train by a recipe; return its learning curve on the validation tasks, and its score as the last point.
+    """Train by a recipe; return its learning curve on the validation trips, and its score as the last point.
 
     Raises:
         UsageError: with the last line that the recipe wrote, where it failed.
@@ -218,7 +218,7 @@ def table(curves: DataFrame) -> str:
 def figure(curves: DataFrame) -> Figure:
     """Return SPL over steps and over CPU time: medians over seeds, bands from the least to the highest, and the bars.
 
-    The last point of a run, which is of the score's episodes and not of the validation tasks, is left out for recipes.
+    The last point of a run, which is of the score's episodes and not of the validation trips, is left out for recipes.
     """
     tasks = [task for task in NAMED_TASKS if task in set(curves["task"])]
     drawn = Figure(figsize=(12, 3.6 * math.ceil(len(tasks) / 2)), layout="constrained")

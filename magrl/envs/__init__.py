@@ -1,4 +1,4 @@
-"""The navigation environment, its scenarios and tasks, and its Gymnasium interface (:mod:`magrl.envs.gymnasium`)."""
+"""The navigation environment, its scenarios and trips, and its Gymnasium interface (:mod:`magrl.envs.gymnasium`)."""
 
 from magrl.envs.geomagnetic import GeomagneticNavEnv as GeomagneticNavEnv
 from magrl.envs.random_regions import earth_scenario as earth_scenario
@@ -10,7 +10,7 @@ from magrl.envs.scenario import Scenario as Scenario
 from magrl.envs.scenario import load_scenario as load_scenario
 from magrl.envs.specs import PRIVILEGED_KEYS as PRIVILEGED_KEYS
 from magrl.envs.specs import PUBLIC_KEYS as PUBLIC_KEYS
-from magrl.envs.tasks import TASK_SETS as TASK_SETS
-from magrl.envs.tasks import Tasks as Tasks
-from magrl.envs.tasks import named_tasks as named_tasks
-from magrl.envs.tasks import task_set as task_set
+from magrl.envs.trips import TRIP_SETS as TRIP_SETS
+from magrl.envs.trips import Trips as Trips
+from magrl.envs.trips import named_trips as named_trips
+from magrl.envs.trips import trip_set as trip_set

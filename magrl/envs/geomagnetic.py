@@ -25,7 +25,7 @@ from magrl.envs import specs
 from magrl.envs.regions import Regions, one_region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
-from magrl.envs.tasks import Tasks, random_headings, sample_tasks
+from magrl.envs.trips import Trips, random_headings, sample_trips
 from magrl.errors.base import LEG_ERROR
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, geodesic, move, polar, wrap_angle
@@ -44,8 +44,8 @@ class GeomagneticNavEnv(EnvBase):
     the scenario has several regions, each episode draws its own.
 
     Args:
-        scenario: region, field, tasks, and rules of an episode; by default the paper's. Where it has frozen tasks,
-            vehicle i flies task ``i + k * num_envs`` in episode k, counted around the set.
+        scenario: region, field, trips, and rules of an episode; by default the paper's. Where it has frozen trips,
+            vehicle i flies trip ``i + k * num_envs`` in episode k, counted around the set.
         num_envs: number of vehicles in the batch.
         drift_km: how much farther than its command a :class:`~magrl.errors.MotionError` may carry a vehicle [km].
             Above 0, the key ``leg_error`` ``(N, 2)`` holds what such an error adds to a leg, northward and eastward
@@ -54,7 +54,7 @@ class GeomagneticNavEnv(EnvBase):
         proximity_weight: reward per unit of the objective, zeta_2.
         objective_limit: upper bound on the objective in that reward; None, as in the paper.
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
-        seed: seed of tasks and start headings; by default a random training seed.
+        seed: seed of trips and start headings; by default a random training seed.
         device: device of the batch.
         **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``.
 
@@ -63,7 +63,7 @@ class GeomagneticNavEnv(EnvBase):
         ValueError: for an option out of its range, naming it and its value.
 
     Attributes:
-        vehicle: ``(N,)`` number of each vehicle, from 0 on. With its seed and its episode it determines task, start
+        vehicle: ``(N,)`` number of each vehicle, from 0 on. With its seed and its episode it determines trip, start
             heading and errors, so that an environment of few vehicles with other numbers repeats episodes of a larger
             one.
 
@@ -136,7 +136,7 @@ class GeomagneticNavEnv(EnvBase):
         self.set_seed(int(torch.randint(FIRST_RESERVED_SEED, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
-        """Keep the rules of a scenario, and its regions, tasks and field on the device of the batch."""
+        """Keep the rules of a scenario, and its regions, trips and field on the device of the batch."""
         self.scenario = scenario
         self.max_steps, self.max_leg_km, self.max_turn_rad = (
             getattr(scenario, name) for name in ("max_steps", "max_leg_km", "max_turn_rad")
@@ -147,7 +147,7 @@ class GeomagneticNavEnv(EnvBase):
         self.register_buffer("action_low", torch.cat((self.action_high.new_zeros(1), -self.action_high[1:])))
         # Modules of the scenario stay where they are.
         self.region, self.edge = copy.deepcopy(scenario.region).to(self.device), scenario.edge.to(self.device)
-        self.tasks = scenario.tasks and Tasks(*(values.to(self.device) for values in scenario.tasks))
+        self.trips = scenario.trips and Trips(*(values.to(self.device) for values in scenario.trips))
         field = scenario.build_field(self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
         if isinstance(field, torch.nn.Module):  # a copy, which shares its buffers until one of them is moved
@@ -252,7 +252,7 @@ class GeomagneticNavEnv(EnvBase):
     def _start_of(self, row: Tensor) -> TensorDict:
         """Return the first observation of the next episode of the vehicles in some rows, ``(P,)``."""
         vehicle, episode = self.vehicle[row], self.episode[row]
-        start, target, region = self._tasks(vehicle, episode)
+        start, target, region = self._trips(vehicle, episode)
         field, target_field = elements_at(self.field, torch.stack((start, target)), region)
         # Rounded as the vehicle observes it: a leg of length 0 must not change the objective.
         field, target_field = field.float().double(), target_field.float().double()
@@ -274,12 +274,12 @@ class GeomagneticNavEnv(EnvBase):
         zeros = {name: spec.zero()[row] for name, spec in others.items() if name not in values}
         return TensorDict(values | zeros, batch_size=vehicle.shape, device=self.device)
 
-    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks:
-        if self.tasks is None:
+    def _trips(self, vehicle: Tensor, episode: Tensor) -> Trips:
+        if self.trips is None:
             distances, law = self.scenario.distance_range_km, self.scenario.distance_law
-            return sample_tasks(self.region, distances, self.seed, vehicle, episode, law)
-        rows = (vehicle + episode * self.num_envs) % len(self.tasks.start)
-        return Tasks(*(values.to(self.device)[rows] for values in self.tasks))  # the batch may have moved
+            return sample_trips(self.region, distances, self.seed, vehicle, episode, law)
+        rows = (vehicle + episode * self.num_envs) % len(self.trips.start)
+        return Trips(*(values.to(self.device)[rows] for values in self.trips))  # the batch may have moved
 
     # Step
 

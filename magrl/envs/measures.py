@@ -219,7 +219,7 @@ def summarize(episodes: Mapping[str, Tensor] | TensorDictBase) -> dict[str, floa
         ``success_rate_low``, ``success_rate_high``), ``spl`` and ``path_efficiency`` [%] with their bootstrap 95 %
         intervals; ``success_rate_within_10km`` and ``success_rate_within_25km`` [%], the share of all episodes that end
         within that distance of the destination, whatever the field there, and ``final_distance_km_median`` of all;
-        means over successes for the others, probably as in the paper, NaN without any; and ``num_tasks``.
+        means over successes for the others, probably as in the paper, NaN without any; and ``num_trips``.
 
     Raises:
         ValueError: for no episode, or ``success`` that is not bool.
@@ -240,7 +240,7 @@ def summarize(episodes: Mapping[str, Tensor] | TensorDictBase) -> dict[str, floa
     for name, key, statistic, *_ in MEASURES:
         if name in episodes.keys() or name not in DECLARED:  # noqa: SIM118 - a TensorDict is no mapping
             summary |= {key + end: value for end, value in statistic(episodes[name], success).items()}
-    return summary | {"num_tasks": len(success)}
+    return summary | {"num_trips": len(success)}
 
 
 _ENDS = torch.tensor((0.025, 0.975), dtype=torch.float64)
@@ -309,7 +309,7 @@ def stratified_bootstrap(strata: Sequence[Tensor], resamples: int = 10_000, seed
 
     Runs are drawn with replacement within each stratum, as many as it has, and taken together. A stratum holds the runs
     of one experiment; several strata are, for example, trainings with different numbers of threads. The score of a run
-    is its mean over all tasks: all its episodes are of one policy, so that drawing them independently of each other
+    is its mean over all trips: all its episodes are of one policy, so that drawing them independently of each other
     would leave out the variation between runs. With fewer than ten runs the interval is too narrow: of five normal
     values it holds the true mean in 90 % of experiments instead of 95 %, of three in 76 %.
 
@@ -326,7 +326,7 @@ def stratified_bootstrap(strata: Sequence[Tensor], resamples: int = 10_000, seed
 
     Source:
         R. Agarwal et al., Deep reinforcement learning at the edge of the statistical precipice, NeurIPS (2021), whose
-        strata are the tasks of a benchmark, each with its own runs.
+        strata are the trips of a benchmark, each with its own runs.
 
     Example:
         >>> stratified_bootstrap([torch.full((5,), 99.0), torch.full((3,), 99.0)])

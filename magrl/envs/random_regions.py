@@ -62,8 +62,8 @@ def earth_scenario(
 
     Example:
         >>> scenario = earth_scenario(8, seed=0)
-        >>> tasks = scenario.random_tasks(20, seed=1)
-        >>> tasks.start.shape, tasks.region.shape
+        >>> trips = scenario.random_trips(20, seed=1)
+        >>> trips.start.shape, trips.region.shape
         (torch.Size([20, 2]), torch.Size([20]))
     """
     earth = wmmhr_coefficients(date) if crust else igrf_coefficients(date, generation)

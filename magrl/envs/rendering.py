@@ -121,7 +121,7 @@ def draw_tracks(
     Args:
         axes: axes to draw on.
         field: any model of :mod:`magrl.field`.
-        region: region of the tasks; grown to contain all of the paths.
+        region: region of the trips; grown to contain all of the paths.
         paths: one ``(T, 2)`` latitude, longitude [deg] for each episode.
         targets: ``(len(paths), 2)`` [deg].
         outlines: of areas, each ``(P, 2)`` [deg].

@@ -1,4 +1,4 @@
-"""Scenarios: where tasks lie, the field there, and the tasks themselves, from Python or from a TOML or JSON file."""
+"""Scenarios: where trips lie, the field there, and the trips themselves, from Python or from a TOML or JSON file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from magrl import guidance, paper
 from magrl.checks import CheckedModel, check_number, check_numbers, check_type, short
 from magrl.envs.regions import PAPER_REGION, Region, Regions, check_expansions
 from magrl.envs.specs import field_bounds
-from magrl.envs.tasks import Tasks, check_distance_range, check_tasks, task_set
+from magrl.envs.trips import Trips, check_distance_range, check_trips, trip_set
 from magrl.field import (
     IGRF,
     Date,
@@ -71,15 +71,15 @@ def _region(value: object) -> object:
     return Regions.of(region)
 
 
-def _tasks(value: object) -> object:
+def _trips(value: object) -> object:
     if isinstance(value, tuple | list) and len(value) == 2:
         try:
-            return Tasks(*value)
+            return Trips(*value)
         except TypeError as error:
             raise ValueError(str(error)) from error
-    if value is not None and not isinstance(value, Tasks):
-        form = "Tasks(start, target), each (M, 2) latitude and longitude [deg]"
-        raise ValueError(f"tasks must be {form}, got {short(value)}")
+    if value is not None and not isinstance(value, Trips):
+        form = "Trips(start, target), each (M, 2) latitude and longitude [deg]"
+        raise ValueError(f"trips must be {form}, got {short(value)}")
     return value
 
 
@@ -110,12 +110,12 @@ def _mean_changes(field: FieldModel | FieldBank, region: Regions) -> Tensor:
 
 
 class Scenario(EpisodeRules):
-    """Where tasks lie, the field there, how far apart their ends are, and the rules of an episode; by default the
+    """Where trips lie, the field there, how far apart their ends are, and the rules of an episode; by default the
     paper's.
 
     Raises:
         ValueError: naming the value: for distances that the region cannot hold, a date outside the field model, an
-            altitude out of range, tasks beyond the region's margin, or another number of names than of tasks.
+            altitude out of range, trips beyond the region's margin, or another number of names than of trips.
 
     Example:
         >>> azores = Scenario(region=Region((35, 45), (-35, -25)), date="2026-07-01", generation=14)
@@ -125,11 +125,11 @@ class Scenario(EpisodeRules):
 
     region: Annotated[Any, BeforeValidator(_region)] = PAPER_REGION
     """Box of starts and destinations, given as a :class:`Region`, kept as :class:`Regions`; or several boxes, of which
-    every random task draws one, with a bank as ``field``."""
+    every random trip draws one, with a bank as ``field``."""
     distance_range_km: Annotated[tuple[float, float], numbers_validator("distance_range_km", 2)] = paper.DISTANCE_KM
-    """Shortest and longest distance from start to destination of random tasks [km]."""
+    """Shortest and longest distance from start to destination of random trips [km]."""
     distance_law: Literal["area", "log"] = "area"
-    """Law of the distances of random tasks: both ends uniform over the region given that their distance is in the range
+    """Law of the distances of random trips: both ends uniform over the region given that their distance is in the range
     (``"area"``), or log-uniform distances in the whole range (``"log"``)."""
     date: Annotated[Date, BeforeValidator(parse_date)] = parse_date(paper.DATE)
     """Date of the field: ``datetime``, ``date``, ISO text or decimal year; kept as a ``datetime``."""
@@ -148,10 +148,10 @@ class Scenario(EpisodeRules):
     field: Annotated[Any, BeforeValidator(_field)] = None
     """Field model (:class:`magrl.field.FieldModel`) instead of IGRF; over many regions a
     :class:`magrl.field.FieldBank` with an expansion for each, of every place that a vehicle can reach."""
-    tasks: Annotated[Tasks | None, BeforeValidator(_tasks)] = None
-    """Frozen tasks to fly instead of random ones; by default in region 0."""
+    trips: Annotated[Trips | None, BeforeValidator(_trips)] = None
+    """Frozen trips to fly instead of random ones; by default in region 0."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
-    """Names of the frozen tasks, or none."""
+    """Names of the frozen trips, or none."""
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode; ``"random"`` is uniform."""
 
@@ -163,27 +163,27 @@ class Scenario(EpisodeRules):
             check_number(0, above=True, objective_floors=min(self.objective_floors))
         if self.field is None:
             igrf_coefficients(self.date, self.generation)
-        if self.tasks is None:
+        if self.trips is None:
             check_distance_range(self.region, self.distance_range_km, self.distance_law)
         else:
-            object.__setattr__(self, "tasks", self._checked_tasks(self.tasks))
-        count = 0 if self.tasks is None else len(self.tasks.start)
+            object.__setattr__(self, "trips", self._checked_trips(self.trips))
+        count = 0 if self.trips is None else len(self.trips.start)
         if self.names and len(self.names) != count:
-            raise ValueError(f"names must hold one name for each of {count} tasks, got {short(self.names)}")
+            raise ValueError(f"names must hold one name for each of {count} trips, got {short(self.names)}")
         return self
 
-    def _checked_tasks(self, tasks: Tasks) -> Tasks:
+    def _checked_trips(self, trips: Trips) -> Trips:
         try:
-            return check_tasks(tasks, self.edge)
+            return check_trips(trips, self.edge)
         except ValueError as error:
-            text = str(error) if str(error).startswith("tasks") else f"tasks: {error}"
+            text = str(error) if str(error).startswith("trips") else f"trips: {error}"
             if "lies outside" in text and len(self.region) == 1:
-                text += f": raise margin_deg from {self.margin_deg:g} to at least {self._margin_to(tasks):g}"
+                text += f": raise margin_deg from {self.margin_deg:g} to at least {self._margin_to(trips):g}"
             raise ValueError(text) from error
 
-    def _margin_to(self, tasks: Tasks) -> float:
-        """Return the margin that would hold all tasks, rounded up to half a degree."""
-        ends, region = torch.cat(tasks[:2]).double(), self.region[0]
+    def _margin_to(self, trips: Trips) -> float:
+        """Return the margin that would hold all trips, rounded up to half a degree."""
+        ends, region = torch.cat(trips[:2]).double(), self.region[0]
         (low, high) = torch.tensor((region.latitude, region.longitude), dtype=torch.float64).T
         beyond = (region.unwrapped(ends) - (low + high) / 2).abs() - (high - low) / 2
         return math.ceil(2 * beyond.max().item()) / 2
@@ -260,18 +260,18 @@ class Scenario(EpisodeRules):
         except TypeError:  # a field without a hash
             return _mean_changes.__wrapped__(field, self.region)
 
-    def random_tasks(self, num_tasks: int, seed: int) -> Tasks:
-        """Return a frozen set of random tasks, see :func:`magrl.envs.tasks.task_set`."""
-        return task_set(num_tasks, seed, self.region, self.distance_range_km, self.distance_law)
+    def random_trips(self, num_trips: int, seed: int) -> Trips:
+        """Return a frozen set of random trips, see :func:`magrl.envs.trips.trip_set`."""
+        return trip_set(num_trips, seed, self.region, self.distance_range_km, self.distance_law)
 
-    def with_tasks(self, tasks: Tasks | None) -> Scenario:
-        """Return the same scenario with other frozen tasks, or with random ones for None.
+    def with_trips(self, trips: Trips | None) -> Scenario:
+        """Return the same scenario with other frozen trips, or with random ones for None.
 
         Example:
-            >>> len(Scenario().with_tasks(Scenario().random_tasks(5, seed=0)).tasks.start)
+            >>> len(Scenario().with_trips(Scenario().random_trips(5, seed=0)).trips.start)
             5
         """
-        return self.replace(tasks=tasks, names=())
+        return self.replace(trips=trips, names=())
 
 
 RULES = (*EpisodeRules.model_fields, "start_heading", "margin_deg")
@@ -305,25 +305,25 @@ def _name(value: object) -> object:
     return value
 
 
-class TaskEntry(CheckedModel):
-    """A task in a file."""
+class TripEntry(CheckedModel):
+    """A trip in a file."""
 
     start: Annotated[tuple[float, float], numbers_validator("start", 2)]
     target: Annotated[tuple[float, float], numbers_validator("target", 2)]
     name: Annotated[str | None, BeforeValidator(_name)] = Field(None, validate_default=False)
 
 
-class TaskEntries(CheckedModel):
-    """The tasks in a file."""
+class TripEntries(CheckedModel):
+    """The trips in a file."""
 
-    tasks: list[TaskEntry]
+    trips: list[TripEntry]
 
 
 def load_scenario(path: Path | str, **changes: Any) -> Scenario:
     """Read a scenario from a TOML or JSON file, whose keys are the fields of :class:`Scenario`.
 
     ``region`` and ``date`` are required. ``generation`` is 14 and ``objective_floors`` follow the region unless given.
-    ``tasks`` is a list of tables with ``start`` and ``target`` (latitude, longitude in degrees) and perhaps ``name``.
+    ``trips`` is a list of tables with ``start`` and ``target`` (latitude, longitude in degrees) and perhaps ``name``.
 
     Args:
         path: file that ends in ``.toml`` or ``.json``.
@@ -362,15 +362,15 @@ def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
     if missing := [name for name in ("region", "date") if name not in content]:
         raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
     values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
-    if "tasks" in content:
-        values["names"], values["tasks"] = _listed_tasks(content["tasks"])
+    if "trips" in content:
+        values["names"], values["trips"] = _listed_trips(content["trips"])
     return Scenario(**(values | changes))
 
 
-def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
+def _listed_trips(listed: Any) -> tuple[tuple[str, ...], Trips | None]:
     """Return names and ends of a list of tables."""
-    entries = TaskEntries(tasks=listed).tasks
+    entries = TripEntries(trips=listed).trips
     if not entries:
         return (), None
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
-    return tuple(e.name or f"task {number}" for number, e in enumerate(entries, 1)), Tasks(start, target)
+    return tuple(e.name or f"trip {number}" for number, e in enumerate(entries, 1)), Trips(start, target)

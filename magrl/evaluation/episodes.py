@@ -46,7 +46,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase, *, strict: bo
     """Return a rollout of exactly one episode of each vehicle, without exploration or gradients.
 
     A stochastic policy acts by its deterministic sample, and modules are in their mode ``eval()``. It is the first
-    episode of each vehicle: tasks, start headings and sensor noise are the same in every call. From its first action
+    episode of each vehicle: trips, start headings and sensor noise are the same in every call. From its first action
     on that is not finite in float32, a vehicle stands still, with a warning that names it.
 
     Args:

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_device
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Trips, named_trips
 from magrl.errors import KnownPlace, TargetErrors, with_conditions
 from magrl.errors.conditions import CONDITIONS, Conditions, conditions_named
 from magrl.errors.north import MAGNETIC
@@ -111,7 +111,7 @@ class Flight:
     Args:
         scenario: scenario. The stated weather is for its longest distance.
         sheet: data sheet of the vehicles; perfect sensors, and no other knowledge, by default.
-        num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
+        num_envs: number of vehicles; by default one for each trip of the scenario, and one without trips.
         seed: random seed of the errors, random start headings and metaheuristics.
         device: device of the environment.
         options: fields of :class:`Sheet` that replace the sheet's, such as ``errors``; and further options of
@@ -152,8 +152,8 @@ class Flight:
         north = MAGNETIC if conditions.std.magnetic else "true"
         self.sheet = sheet.replace(errors=sheet.errors or PERFECT.noise, north=north)
         self.rules = sheet.rules(scenario, conditions)
-        tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)
-        options |= {"num_envs": tasks if num_envs is None else num_envs, "seed": seed, "device": device}
+        trips = 1 if scenario.trips is None else len(scenario.trips.start)
+        options |= {"num_envs": trips if num_envs is None else num_envs, "seed": seed, "device": device}
         drift = {"drift_km": conditions.drift_km(options.get("max_leg_km", scenario.max_leg_km))}
         self.base = GeomagneticNavEnv(scenario, **drift | options)
         self.env = with_conditions(self.base, conditions, seed)
@@ -209,26 +209,26 @@ class Flight:
         return evaluation_rollout(self.env_of(policy), policy)
 
 
-def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, **options: Any) -> TensorDict:
-    """Fly each task exactly once, without exploration, and return the measures of the episodes.
+def evaluate(policy: TensorDictModuleBase | str, trips: Scenario | Trips | str, **options: Any) -> TensorDict:
+    """Fly each trip exactly once, without exploration, and return the measures of the episodes.
 
     Args:
         policy: policy or navigator of the plain environment, or the text that names one, as
             :func:`magrl.navigators.names.make_navigator` takes it: ``"secant"``, ``"sac.onnx"``. A
             trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
-        tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
+        trips: scenario with trips; or trips, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.
-        options: of :class:`Flight`, such as ``errors`` and other fields of :class:`Sheet`. All tasks are flown at once:
+        options: of :class:`Flight`, such as ``errors`` and other fields of :class:`Sheet`. All trips are flown at once:
             split a set that is too large.
 
     Returns:
-        ``(M,)``, one row for each task in its order, with the measures of
+        ``(M,)``, one row for each trip in its order, with the measures of
         :func:`magrl.evaluation.episode_measures`. :func:`magrl.evaluation.summarize` takes it, and
         ``pandas.DataFrame(episodes.to_dict(convert_tensors="numpy"))`` is its data frame.
 
     Raises:
-        TypeError: for a policy that is not callable, or tasks of another type.
-        ValueError: for a scenario without tasks, a policy of another field or of longer legs, or another value out of
+        TypeError: for a policy that is not callable, or trips of another type.
+        ValueError: for a scenario without trips, a policy of another field or of longer legs, or another value out of
             its range.
 
     Example:
@@ -236,14 +236,14 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
         >>> episodes.shape, episodes["success"].double().mean()
         (torch.Size([100]), tensor(1., dtype=torch.float64))
     """
-    flight = Flight(_with_tasks(tasks), **options)
+    flight = Flight(_with_trips(trips), **options)
     return TensorDict(episode_measures(flight.fly(policy)), [flight.base.num_envs])
 
 
-def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
-    """Return a scenario with tasks; raise if it has none."""
-    tasks = named_tasks(tasks) if isinstance(tasks, str) else tasks
-    scenario = tasks if isinstance(tasks, Scenario) else Scenario().with_tasks(tasks)
-    if scenario.tasks is None:
-        raise ValueError("the scenario has no tasks to fly: scenario.with_tasks(scenario.random_tasks(300, seed=0))")
+def _with_trips(trips: Scenario | Trips | str) -> Scenario:
+    """Return a scenario with trips; raise if it has none."""
+    trips = named_trips(trips) if isinstance(trips, str) else trips
+    scenario = trips if isinstance(trips, Scenario) else Scenario().with_trips(trips)
+    if scenario.trips is None:
+        raise ValueError("the scenario has no trips to fly: scenario.with_trips(scenario.random_trips(300, seed=0))")
     return scenario

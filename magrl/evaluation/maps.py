@@ -134,9 +134,9 @@ def trajectories_figure(
     Args:
         rollouts: ``(M, T)`` from the environment, or several of them by title.
         field: any model of :mod:`magrl.field`.
-        region: region of the tasks.
+        region: region of the trips.
         episodes: number of episodes to show.
-        names: names of the tasks, which are written at their destinations.
+        names: names of the trips, which are written at their destinations.
 
     Raises:
         ValueError: for no rollout or no episode.
@@ -176,7 +176,7 @@ def _draw_map(axes: Axes, rollout: TensorDictBase, field: FieldModel, region: Re
         axes: axes to draw on.
         rollout: ``(M, T)`` from the environment.
         field: any model of :mod:`magrl.field`.
-        region: region of the tasks.
+        region: region of the trips.
 
     Returns:
         The tracks (:func:`episode_tracks`), and the height of a figure of 8 inches.

@@ -1,4 +1,4 @@
-"""Scenarios of evaluations: frozen tasks, and the scenario keys that a command line can change."""
+"""Scenarios of evaluations: frozen trips, and the scenario keys that a command line can change."""
 
 from __future__ import annotations
 
@@ -6,66 +6,66 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magrl.checks import check_number
-from magrl.envs import Scenario, Tasks, load_scenario, named_tasks
+from magrl.envs import Scenario, Trips, load_scenario, named_trips
 from magrl.envs.scenario import RULES, rule_settings
-from magrl.envs.tasks import RANDOM_SETS
+from magrl.envs.trips import RANDOM_SETS
 from magrl.random_numbers import FIRST_RESERVED_SEED
 
-TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
-FIRST_TASKS_SEED = 2 * FIRST_RESERVED_SEED
-"""Seed of random tasks with --tasks-seed 0: beyond the seeds of trainings and of frozen sets."""
+TripSet = Literal["test-1000", "paper-100", "figure-4-1"]
+FIRST_TRIPS_SEED = 2 * FIRST_RESERVED_SEED
+"""Seed of random trips with --trips-seed 0: beyond the seeds of trainings and of frozen sets."""
 
 ScenarioOptions: Any = rule_settings(**dict.fromkeys((*RULES, "altitude_km")))
 """Fields of a scenario that a command line can change, each None for its value in the scenario's file or in the
 trainings, or its default."""
 
 
-def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | None = None, **changes: Any) -> Scenario:
-    """Return a scenario with frozen tasks.
+def choose_trips(path: Path | None, trips: str | int | None, trips_seed: int | None = None, **changes: Any) -> Scenario:
+    """Return a scenario with frozen trips.
 
     Args:
         path: scenario file; the paper's scenario by default.
-        tasks: task set, or number of random tasks; by default the scenario's own tasks, or ``test-1000`` where it has
+        trips: trip set, or number of random trips; by default the scenario's own trips, or ``test-1000`` where it has
             none.
-        tasks_seed: seed of random tasks; 0 by default.
+        trips_seed: seed of random trips; 0 by default.
         **changes: keys of the scenario that replace its own.
 
     Raises:
-        ValueError: for a file that is not a scenario, the paper's example task in another scenario, or a seed for tasks
+        ValueError: for a file that is not a scenario, the paper's example trip in another scenario, or a seed for trips
             that are not random.
         FileNotFoundError: for a missing file.
 
     Example:
-        >>> choose_tasks(None, 30, 7).tasks.start.shape
+        >>> choose_trips(None, 30, 7).trips.start.shape
         torch.Size([30, 2])
     """
     scenario = Scenario(**changes) if path is None else load_scenario(path, **changes)
-    if isinstance(tasks, int):
-        tasks_seed = 0 if tasks_seed is None else tasks_seed
-        check_number(0, 2**62, whole=True, tasks_seed=tasks_seed)
-        return scenario.with_tasks(scenario.random_tasks(tasks, FIRST_TASKS_SEED + tasks_seed))
-    if tasks_seed is not None:
-        raise ValueError(f"--tasks-seed {tasks_seed} needs a number of random tasks, such as --tasks 300")
+    if isinstance(trips, int):
+        trips_seed = 0 if trips_seed is None else trips_seed
+        check_number(0, 2**62, whole=True, trips_seed=trips_seed)
+        return scenario.with_trips(scenario.random_trips(trips, FIRST_TRIPS_SEED + trips_seed))
+    if trips_seed is not None:
+        raise ValueError(f"--trips-seed {trips_seed} needs a number of random trips, such as --trips 300")
     if path is None:
-        return scenario.with_tasks(named_tasks(tasks or "test-1000"))
-    if tasks == "figure-4-1":
-        raise ValueError("--tasks figure-4-1 lies in the paper's region: omit it, or --scenario")
-    if scenario.tasks is not None and tasks is None:
+        return scenario.with_trips(named_trips(trips or "test-1000"))
+    if trips == "figure-4-1":
+        raise ValueError("--trips figure-4-1 lies in the paper's region: omit it, or --scenario")
+    if scenario.trips is not None and trips is None:
         return scenario
-    return scenario.with_tasks(scenario.random_tasks(*RANDOM_SETS[tasks or "test-1000"]))
+    return scenario.with_trips(scenario.random_trips(*RANDOM_SETS[trips or "test-1000"]))
 
 
-def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
-    """Return a scenario with its first tasks only.
+def first_trips(scenario: Scenario, num_trips: int) -> Scenario:
+    """Return a scenario with its first trips only.
 
     Raises:
-        ValueError: for fewer than one task, or more than it has.
+        ValueError: for fewer than one trip, or more than it has.
 
     Example:
-        >>> first_tasks(choose_tasks(None, "paper-100"), 3).tasks.start.shape
+        >>> first_trips(choose_trips(None, "paper-100"), 3).trips.start.shape
         torch.Size([3, 2])
     """
-    assert scenario.tasks is not None
-    check_number(1, len(scenario.tasks.start), whole=True, num_tasks=num_tasks)
-    tasks = Tasks(*(values[:num_tasks] for values in scenario.tasks))
-    return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
+    assert scenario.trips is not None
+    check_number(1, len(scenario.trips.start), whole=True, num_trips=num_trips)
+    trips = Trips(*(values[:num_trips] for values in scenario.trips))
+    return scenario.replace(trips=trips, names=scenario.names[:num_trips])

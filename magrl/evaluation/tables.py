@@ -1,7 +1,7 @@
 """Markdown tables that compare navigators, with the paper's results beside them.
 
-Several runs of a navigator are shown by their interquartile mean, a single one by its mean over the tasks. Parentheses
-hold 95 % intervals: over runs for ten runs or more (stratified bootstrap), over tasks for a single run. Brackets hold
+Several runs of a navigator are shown by their interquartile mean, a single one by its mean over the trips. Parentheses
+hold 95 % intervals: over runs for ten runs or more (stratified bootstrap), over trips for a single run. Brackets hold
 the smallest and largest of two to nine runs, for which a bootstrap interval would be too narrow.
 """
 

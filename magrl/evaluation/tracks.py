@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from magrl import paper
-from magrl.envs import PUBLIC_KEYS, Scenario, Tasks, earth_scenario, named_tasks
+from magrl.envs import PUBLIC_KEYS, Scenario, Trips, earth_scenario, named_trips
 from magrl.errors import Conditions, conditions_named
 from magrl.evaluation import Flight, Sheet
 from magrl.files import write_atomically
@@ -34,14 +34,14 @@ VEHICLES = ("aircraft", "ship", "underwater", "low-cost")
 DRIFT_KM = 40.0
 """How much farther than the longest leg errors may carry a vehicle [km], for one environment under all conditions."""
 SEED = 3 * FIRST_RESERVED_SEED
-"""Seed of regions and tasks, beyond the seeds of trainings and of frozen sets."""
+"""Seed of regions and trips, beyond the seeds of trainings and of frozen sets."""
 READINGS = (*PUBLIC_KEYS, "elapsed_steps")
 """Keys of the readings, without the accuracy of the sensors."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """Tasks and errors under which navigators fly them.
+    """Trips and errors under which navigators fly them.
 
     Example:
         >>> TRACKS["alone-v2"].max_steps, TRACKS["alone-v2"].within_km
@@ -52,12 +52,12 @@ class Track:
     """Errors of real vehicles; by default there is white noise of several levels."""
     levels: Sequence[Noise] = ()
     """Standard deviations of white noise on D [deg], I [deg], B_H [nT]; :data:`LEVELS` without conditions."""
-    tasks: int = 1000
-    """Number of tasks."""
+    trips: int = 1000
+    """Number of trips."""
     regions: int = 128
     """Number of random regions of the Earth."""
     distance_km: Sequence[float] = paper.DISTANCE_KM
-    """Shortest and longest distance of a task [km]."""
+    """Shortest and longest distance of a trip [km]."""
     max_steps: int = 50
     """Legs after which an episode ends."""
     within_km: float | None = None
@@ -67,7 +67,7 @@ class Track:
     crust: bool = False
     """Whether the field is WMMHR, with crust, or IGRF-14."""
     box: bool = False
-    """Whether the tasks are in the paper's box, ``test-1000``, or in random regions."""
+    """Whether the trips are in the paper's box, ``test-1000``, or in random regions."""
     date: str = "2025-01-01"
     """Date of IGRF-14 outside the paper's box."""
     seed: int = 0
@@ -84,31 +84,31 @@ class Track:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """Scenario of the tasks, with room for all errors of motion."""
+        """Scenario of the trips, with room for all errors of motion."""
         far = self.distance_km[1] > paper.DISTANCE_KM[1]
         size: dict[str, Any] = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"max_latitude": 70}
         size |= {"distance_range_km": tuple(self.distance_km), "max_leg_km": 50.0 + DRIFT_KM * bool(self.conditions)}
         size |= {"date": self.date, "start_heading": "random"} | ({"crust": True, "degree": 60} if self.crust else {})
         earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size)
-        tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
+        trips = named_trips("test-1000") if self.box else earth.random_trips(self.trips, SEED)
         rule: dict[str, Any] = {"arrival": "declared", "radius_km": self.within_km} if self.within_km else {}
         scenario = earth.replace(max_steps=self.max_steps, **rule)
-        return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
+        return scenario.with_trips(Trips(*(ends[: self.trips] for ends in trips)))
 
-    def flight(self, errors: Noise | Conditions, tasks: Tasks | None = None, **changes: Any) -> Flight:
-        """Return vehicles with some errors, one for each task.
+    def flight(self, errors: Noise | Conditions, trips: Trips | None = None, **changes: Any) -> Flight:
+        """Return vehicles with some errors, one for each trip.
 
         Args:
             errors: of a level of :attr:`errors`.
-            tasks: tasks that replace the track's.
+            trips: trips that replace the track's.
             changes: options of :class:`~magrl.evaluation.Flight` that replace the track's.
         """
-        scenario = self.scenario if tasks is None else self.scenario.with_tasks(tasks)
+        scenario = self.scenario if trips is None else self.scenario.with_trips(trips)
         return Flight(scenario, **{"sheet": self.sheet, "errors": errors, "seed": self.seed} | changes)
 
     def record(self) -> dict[str, Any]:
-        """Return the declaration of the track as plain data, and the digest of its tasks."""
-        ends = self.scenario.tasks
+        """Return the declaration of the track as plain data, and the digest of its trips."""
+        ends = self.scenario.trips
         assert ends is not None
         fixed = {"levels": self.levels or LEVELS, "known_start": None}  # a key of the first declarations
         known = self.sheet.model_dump(include={"north", "confidence"}) | self.sheet.model_dump(exclude_unset=True)
@@ -116,7 +116,7 @@ class Track:
         del declared["sheet"]
         if not self.crust:  # as the first tracks were declared
             del declared["crust"]
-        return declared | {"tasks_sha256": digest(torch.cat((*ends[:2], ends.region.unsqueeze(-1)), -1))}
+        return declared | {"trips_sha256": digest(torch.cat((*ends[:2], ends.region.unsqueeze(-1)), -1))}
 
 
 def digest(values: Tensor, digits: int = 6) -> str:
@@ -142,9 +142,9 @@ def digest(values: Tensor, digits: int = 6) -> str:
 
 TRACKS = {
     "box-v2": Track(box=True, levels=(PERFECT.noise, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))),
-    "earth-v2": Track(tasks=2000),
+    "earth-v2": Track(trips=2000),
     "alone-v2": Track(within_km=25, max_steps=80),
-    "vehicles-v3": Track(tasks=300, within_km=25, max_steps=120, sheet=Sheet(confidence=0.8), conditions=VEHICLES),
+    "vehicles-v3": Track(trips=300, within_km=25, max_steps=120, sheet=Sheet(confidence=0.8), conditions=VEHICLES),
     "north-v1": Track(
         within_km=25,
         max_steps=80,
@@ -160,7 +160,7 @@ COLUMNS = {
     "navigator": str,
     "run": int,
     "level": str,
-    "task": int,
+    "trip": int,
     "region": int,
     "seed": int,
     "success": bool,
@@ -176,21 +176,21 @@ def episode_table(measures: Mapping[str, Tensor], region: Tensor, **labels: str 
     """Return a row for each episode.
 
     Args:
-        measures: ``(M,)`` each, of :func:`magrl.evaluation.episode_measures`, in the order of the tasks.
-        region: ``(M,)`` index of the region of each task.
+        measures: ``(M,)`` each, of :func:`magrl.evaluation.episode_measures`, in the order of the trips.
+        region: ``(M,)`` index of the region of each trip.
         labels: columns that are the same in each row, such as ``navigator`` and ``level``; empty or 0 by default.
 
     Example:
         >>> ends = {"success": torch.tensor([True]), "steps": torch.tensor([9])}
         >>> ends |= {"spl": torch.tensor([0.5]), "navigation_error_km": torch.tensor([4.0])}
-        >>> episode_table(ends, torch.tensor([5]), navigator="secant")[["task", "region", "spl"]].values.tolist()
+        >>> episode_table(ends, torch.tensor([5]), navigator="secant")[["trip", "region", "spl"]].values.tolist()
         [[0.0, 5.0, 0.5]]
     """
     columns = {
         **dict.fromkeys(("track", "navigator", "level"), ""),
         **dict.fromkeys(("run", "seed"), 0),
         **labels,
-        "task": range(len(region)),
+        "trip": range(len(region)),
         "region": region.tolist(),
         "success": measures["success"].tolist(),
         "spl": measures["spl"].double().tolist(),

@@ -22,10 +22,10 @@ RINGS_KM = (80.0, 200.0, 350.0, 500.0)
 """Distances of the places to which local coefficients are fitted [km]; 12 in each ring, and the place itself."""
 PLACES = 12_000
 """Number of places that are the prior where the vehicle does not know its own; an eighth of them gives the same on
-random tasks within .5 points."""
+random trips within .5 points."""
 SPREAD_YEARS = 20.0
 """Least age of a model in the prior of a vehicle that knows no place [years]: places far apart are joined to one normal
-distribution, which is too sure where the places that fit are few. Set on the tasks of table
+distribution, which is too sure where the places that fit are few. Set on the trips of table
 known, to the age of the model beside it."""
 LEAST_NT = 20.0
 """Least standard deviation of the error of a model in each axis at the ground [nT]: currents above the Earth, and what

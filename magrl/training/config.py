@@ -37,7 +37,7 @@ def _check_rising(values: tuple[float, float]) -> tuple[float, float]:
 
 
 LONGEST_KM = 4400.0
-"""Longest distance of a task on a random planet: the side of a region [km]."""
+"""Longest distance of a trip on a random planet: the side of a region [km]."""
 Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
 
 
@@ -59,7 +59,7 @@ class RunConfig(CheckedModel):
     """
 
     seed: Seed = 0
-    """Random seed of weights, exploration and training tasks."""
+    """Random seed of weights, exploration and training trips."""
     out: Path | None = None
     """Run folder; runs/<recipe>-<preset>-seed<seed> by default."""
     resume: Path | None = None
@@ -85,11 +85,11 @@ class RunConfig(CheckedModel):
     total_episodes: Count | None = None
     """Maximum number of training episodes."""
     eval_every: Count = 20
-    """Collected batches between evaluations on the validation tasks."""
-    eval_tasks_small: Count = 200
-    """Number of validation tasks, by which the best policy is selected."""
-    eval_tasks: Count = 1000
-    """Number of test tasks of the final evaluation."""
+    """Collected batches between evaluations on the validation trips."""
+    eval_trips_small: Count = 200
+    """Number of validation trips, by which the best policy is selected."""
+    eval_trips: Count = 1000
+    """Number of test trips of the final evaluation."""
     gamma: Discount = 0.9
     """Discount factor."""
     learning_rate: Positive = 2e-3
@@ -168,7 +168,7 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
     num_regions: Count = 1024
     """Number of training regions, two on each random planet."""
     distance_range_km: Rising = (300.0, 500.0)
-    """Shortest and longest distance of a task [km]."""
+    """Shortest and longest distance of a trip [km]."""
     steps_per_batch: Count = 32
     """Steps of each vehicle in a collected batch."""
     epochs: Count = 8
@@ -208,7 +208,7 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
 
     @property
     def regions(self) -> dict[str, Any]:
-        """Options of the regions: large enough for the longest task, and how the distances are drawn."""
+        """Options of the regions: large enough for the longest trip, and how the distances are drawn."""
         far = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
         size = far if self.distance_range_km[1] > 500 else {"max_latitude": 70}
         return {"distance_range_km": self.distance_range_km, "max_leg_km": self.reach_km, **size}

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from magrl.checks import check_finite, short
 from magrl.commands import UsageError
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Trips
 from magrl.envs.measures import summarize
 from magrl.errors import SensorErrors
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
@@ -41,7 +41,7 @@ from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStat
 from magrl.training.wandb_run import WandbRun
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
-"""Measures of the validation tasks in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
+"""Measures of the validation trips in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
 SHARED = ("guided", "task", "scenario", "zeta", "start_heading", "noise")
 """Settings that the file of the policy holds, for evaluations."""
 
@@ -102,7 +102,7 @@ class Run:
     ``with Run(config, ...) as run`` claims the folder, writes ``config.json`` and handles signals. :meth:`start` takes
     the parts of the training and restores them from the newest checkpoint, if there is one. :meth:`batches` iterates
     over collected batches; after each pass of the loop it checks for non-finite values, evaluates, logs and saves
-    checkpoints. :meth:`finish` evaluates the best policy on the test tasks and writes the results. If an error ends a
+    checkpoints. :meth:`finish` evaluates the best policy on the test trips and writes the results. If an error ends a
     new run before the first batch, its folder is removed.
 
     Args:
@@ -133,7 +133,7 @@ class Run:
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
         self.folder = config.out or Path("runs") / f"{self.name}-seed{config.seed}"
         self._exits = contextlib.ExitStack()
-        self._scenario_env: EnvBase | None = None  # of the tasks in the scenario file
+        self._scenario_env: EnvBase | None = None  # of the trips in the scenario file
 
     # Folder
 
@@ -171,22 +171,22 @@ class Run:
         return settings | {"out": self.folder.name, "resume": None}
 
     def evaluation_envs(self, make: Callable[..., EnvBase], **options: Any) -> tuple[EnvBase, EnvBase]:
-        """Return the environments of the validation tasks and of the test tasks, with the sensor noise of the run.
+        """Return the environments of the validation trips and of the test trips, with the sensor noise of the run.
 
         Args:
             make: function that makes an environment, as of a named task (:mod:`magrl.named_tasks`).
             options: its options.
         """
 
-        def env_of(tasks: Tasks, seed: int) -> EnvBase:
+        def env_of(trips: Trips, seed: int) -> EnvBase:
             sensors = [SensorErrors(self.noise, seed=seed)] if any(self.noise) else []
             plain = {"observation": "dict", "scale_actions": False, "transforms": sensors, "seed": seed, **options}
-            return make(len(tasks.start), scenario=self.scenario.with_tasks(tasks), **plain)
+            return make(len(trips.start), scenario=self.scenario.with_trips(trips), **plain)
 
-        if self.scenario.tasks is not None:
-            self._scenario_env = env_of(self.scenario.tasks, TEST_SEED)
-        sets = (self.config.eval_tasks_small, VALIDATION_SEED), (self.config.eval_tasks, TEST_SEED)
-        validation, test = (env_of(self.scenario.random_tasks(count, seed), seed) for count, seed in sets)
+        if self.scenario.trips is not None:
+            self._scenario_env = env_of(self.scenario.trips, TEST_SEED)
+        sets = (self.config.eval_trips_small, VALIDATION_SEED), (self.config.eval_trips, TEST_SEED)
+        validation, test = (env_of(self.scenario.random_trips(count, seed), seed) for count, seed in sets)
         return validation, test
 
     # Parts
@@ -216,7 +216,7 @@ class Run:
 
         Args:
             policy: agent for evaluations, which is saved.
-            validation: environment of the validation tasks.
+            validation: environment of the validation trips.
             env: environment inside the collector.
             collector: source of batches.
             parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
@@ -306,7 +306,7 @@ class Run:
             check_finite(module.named_parameters(), where)
 
     def _evaluate(self) -> str:
-        """Evaluate on the validation tasks, keep the best policy, add a row of curves; return a short report."""
+        """Evaluate on the validation trips, keep the best policy, add a row of curves; return a short report."""
         rollout = evaluation_rollout(self.validation, self.policy)
         episodes = episode_measures(rollout)
         summary = summarize(episodes) | {"return": returns(rollout).mean().item()}
@@ -320,10 +320,10 @@ class Run:
     # Results
 
     def finish(self, test: EnvBase) -> dict[str, float]:
-        """Save the best policy, evaluate it on the test tasks and write figures and results.
+        """Save the best policy, evaluate it on the test trips and write figures and results.
 
         Args:
-            test: environment of the test tasks.
+            test: environment of the test trips.
 
         Returns:
             The content of ``eval.json``.
@@ -341,7 +341,7 @@ class Run:
         if not self.complete:
             self._report_stop()
         rollout = evaluation_rollout(test, self.policy)
-        result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "tasks_seed": TEST_SEED}
+        result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "trips_seed": TEST_SEED}
         result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
         result["training_seconds"] = seconds
         if len(test.region) == 1:
@@ -372,7 +372,7 @@ class Run:
             arrived = f"{result['steps']:.1f} steps, {kilometers:.0f} km"
             arrived += f", navigation error {result['navigation_error_km']:.1f} km"
         print(
-            f"\n{result['num_tasks']} test tasks: success rate {result['success_rate']:.1f} %, "
+            f"\n{result['num_trips']} test trips: success rate {result['success_rate']:.1f} %, "
             f"SPL {result['spl']:.1f} %, {arrived}\n"
             f"Trained in {result['training_seconds']:.0f} s; results, curves and figures are in {self.folder}"
         )

@@ -29,7 +29,7 @@ class NoGoAreas(EpisodeNumbers):
 
     A vehicle that steers straight at its destination must fail in some episodes, however well it knows the direction.
     Place this before the reward, which reads the success. Distances are those in the plane around the destination.
-    A radius is at most two thirds of the distance from a center to either end of a task.
+    A radius is at most two thirds of the distance from a center to either end of a trip.
 
     Args:
         number: discs of an episode.
@@ -92,7 +92,7 @@ class NoGoAreas(EpisodeNumbers):
         centers = along * start.unsqueeze(-2) + beside * right.unsqueeze(-2)
         radii = RADIUS_KM[0] + (RADIUS_KM[1] - RADIUS_KM[0]) * radius
         ends_km = torch.minimum(centers.norm(dim=-1), (centers - start.unsqueeze(-2)).norm(dim=-1))
-        radii = torch.minimum(radii, 2 / 3 * ends_km)  # both ends of a short task are free
+        radii = torch.minimum(radii, 2 / 3 * ends_km)  # both ends of a short trip are free
         return torch.cat((torch.cat((centers, radii.unsqueeze(-1)), -1).flatten(-2), start), -1)
 
     def _seen(self, relative: Tensor, radii: Tensor, heading: Tensor) -> Tensor:

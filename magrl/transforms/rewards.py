@@ -98,7 +98,7 @@ class ProgressReward(StepReward):
 class HighestSPL(StatefulTransform):
     """Write the highest SPL (success weighted by path length) that an episode can still reach. Privileged.
 
-    It is the SPL of the straight path from the present position: the distance of the task over the path so far plus the
+    It is the SPL of the straight path from the present position: the distance of the trip over the path so far plus the
     true displacement. After an arrival it is the SPL of the episode, after any other end 0.
 
     Args:
@@ -132,10 +132,10 @@ class HighestSPL(StatefulTransform):
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         after, (before, highest) = self._named(values), state
         start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
-        task_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
-        path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + after["leg"][..., :1]
+        trip_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
+        path_km = trip_km / highest - before.norm(dim=-1, keepdim=True) + after["leg"][..., :1]
         whole_km = torch.where(success, path_km, path_km + after["true_displacement"].norm(dim=-1, keepdim=True))
-        reached = task_km / torch.maximum(whole_km, task_km)
+        reached = trip_km / torch.maximum(whole_km, trip_km)
         tensordict.set(self.out_keys[0], torch.where(after["done"] & ~success, torch.zeros_like(reached), reached))
 
 

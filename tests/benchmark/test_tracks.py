@@ -1,4 +1,4 @@
-"""What published numbers rest on is frozen: tasks, readings under errors, and what environments answer to actions.
+"""What published numbers rest on is frozen: trips, readings under errors, and what environments answer to actions.
 
 Other processors change the last bits of a number. So digests hold six digits of the largest of a column, which come
 from float64; four of readings with errors, which are added in float32; and the observations of networks are compared as
@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import magrl  # noqa: F401 - registers the environments
-from magrl.envs import PUBLIC_KEYS, TASK_SETS, named_tasks
+from magrl.envs import PUBLIC_KEYS, TRIP_SETS, named_trips
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.tracks import SEED, TRACKS, digest
 from magrl.named_tasks import PLANET_REGIONS
@@ -29,7 +29,7 @@ TRACK_DIGESTS = {
     "vehicles-v3": ("c293a315e0fae9c6", "f8f5f7e3e6f49ba6"),
     "north-v1": ("e35c4d00c50322a3", "bcb45c2e6536f22e"),
 }
-"""Of the declaration and tasks, and of readings."""
+"""Of the declaration and trips, and of readings."""
 SETS = {"test-1000": "a86aacd1afedb688", "paper-100": "82cb3cd8bee75af2", "figure-4-1": "a7aac085136a6d62"}
 ANSWERS = {
     "magrl/GeomagneticNavigation-v0": ("c8777cf8c2c491ef", -9.9493),
@@ -51,9 +51,10 @@ def actions(count: int, steps: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", TRACKS)
-def test_declaration_and_tasks_of_a_track_are_frozen(name: str) -> None:
-    """As they were declared when they were frozen, with two keys of other names and two more options."""
-    record = json.dumps(TRACKS[name].record() | {"signal_km": None, "task_seed": SEED}, sort_keys=True)
+def test_declaration_and_trips_of_a_track_are_frozen(name: str) -> None:
+    """As they were declared when they were frozen, with four keys of other names and two more options."""
+    record = {key.replace("trip", "task"): value for key, value in TRACKS[name].record().items()}
+    record = json.dumps(record | {"signal_km": None, "task_seed": SEED}, sort_keys=True)
     record = record.replace('"elapsed_steps"', '"step_count"').replace('"leg"', '"move"')
     assert hashlib.sha256(record.encode()).hexdigest()[:16] == TRACK_DIGESTS[name][0], NEW_VERSION
 
@@ -77,9 +78,9 @@ def test_readings_of_a_track_are_frozen(name: str) -> None:
     assert digest(torch.cat(parts), digits=4)[:16] == TRACK_DIGESTS[name][1], NEW_VERSION
 
 
-@pytest.mark.parametrize("name", TASK_SETS)
-def test_task_sets_are_frozen(name: str) -> None:
-    assert digest(torch.cat(named_tasks(name)[:2], -1))[:16] == SETS[name], NEW_VERSION
+@pytest.mark.parametrize("name", TRIP_SETS)
+def test_trip_sets_are_frozen(name: str) -> None:
+    assert digest(torch.cat(named_trips(name)[:2], -1))[:16] == SETS[name], NEW_VERSION
 
 
 def test_the_trainings_have_as_many_planets_as_ever() -> None:

@@ -18,7 +18,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
-from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Trips
 from magrl.envs.navigation import navigation_env
 from magrl.envs.specs import REWARD_TERMS
 from magrl.evaluation import Flight
@@ -38,8 +38,8 @@ def places(*positions: tuple[float, ...]) -> Tensor:
     return torch.tensor(positions, dtype=torch.float64)
 
 
-def task(start: tuple[float, float], target: tuple[float, float]) -> Tasks:
-    return Tasks(places(start), places(target))
+def trip(start: tuple[float, float], target: tuple[float, float]) -> Trips:
+    return Trips(places(start), places(target))
 
 
 def moved(place: tuple[float, float], heading: float, distance_km: float) -> tuple[float, float]:
@@ -131,7 +131,7 @@ def elements_by_ppigrf(latitude: float, longitude: float) -> Tensor:
 
 
 def test_first_observation_is_that_of_the_paper() -> None:
-    td = make(tasks=task(START, TARGET)).reset()[0]
+    td = make(trips=trip(START, TARGET)).reset()[0]
     for key, values in (("field", (8.019, -16.150, 35467.990)), ("target_field", (9.228, -26.923, 35199.415))):
         assert ((td[key] - torch.tensor(values)).abs() < torch.tensor([0.002, 0.002, 1.5])).all(), key
     assert td["position"].tolist() == td["start_position"].tolist() == list(START)
@@ -147,7 +147,7 @@ def test_first_observation_is_that_of_the_paper() -> None:
 
 def test_one_leg_by_hand() -> None:
     turn, end = -3 * math.pi / 4, (-2.3197057250399222, 161.68214048662887)  # 50 km, by GeographicLib 2.1
-    (step,) = fly(make(tasks=task(START, TARGET), max_turn_deg=180.0), (50.0, turn))
+    (step,) = fly(make(trips=trip(START, TARGET), max_turn_deg=180.0), (50.0, turn))
     after = step["next"][0]
     assert after["position"].tolist() == pytest.approx(end, abs=1e-7)  # a centimeter
     assert after["heading"].item() == pytest.approx(turn, abs=1e-6)
@@ -165,7 +165,7 @@ def test_one_leg_by_hand() -> None:
 def test_late_rewards_decay() -> None:
     """Past half of 6 legs, n/6 of the size of the proximity term is taken off: gains shrink and losses grow."""
     turn_back, go_on, stay = (50.0, math.pi), (50.0, 0.0), (0.0, 0.0)
-    env = make(tasks=task(START, TARGET), max_steps=6, max_turn_deg=180.0, proximity_weight=2.5)
+    env = make(trips=trip(START, TARGET), max_steps=6, max_turn_deg=180.0, proximity_weight=2.5)
     steps = fly(env, turn_back, stay, go_on, turn_back, turn_back, go_on)  # south, south, north, south, south
     objective = [3.0, *(step["next", "objective"].item() for step in steps)]
     assert objective[3] < objective[4] > objective[5] > objective[6]
@@ -189,16 +189,16 @@ HERE = (-5.0, 165.0)
 
 def test_the_threshold_is_zeta() -> None:
     """A leg that falls short of it by a little arrives only if zeta is that wide."""
-    tasks = task(HERE, moved(HERE, 0.0, 45.0))
-    left = fly(make(tasks=tasks), (40.0, 0.0))[0]["next", "objective"].item()
+    trips = trip(HERE, moved(HERE, 0.0, 45.0))
+    left = fly(make(trips=trips), (40.0, 0.0))[0]["next", "objective"].item()
     assert left > 0.001
     for zeta, success in ((left * 0.99, False), (left * 1.01, True)):
-        assert fly(make(tasks=tasks, zeta=zeta), (40.0, 0.0))[0]["next", "success"].item() is success
+        assert fly(make(trips=trips, zeta=zeta), (40.0, 0.0))[0]["next", "success"].item() is success
 
 
 def test_arriving_with_the_last_leg_is_an_end_and_not_a_cut() -> None:
     """And the reward at arrival is not decayed, only the proximity term is, here to nothing."""
-    env = make(tasks=task(HERE, moved(HERE, 0.0, 40.0)), max_steps=1, destination_weight=77.0)
+    env = make(trips=trip(HERE, moved(HERE, 0.0, 40.0)), max_steps=1, destination_weight=77.0)
     after = fly(env, (40.0, 0.0))[0]["next"]
     assert [bool(after[key]) for key in ("success", "terminated", "done", "truncated")] == [True, True, True, False]
     assert after["reward"].item() == pytest.approx(77.0, abs=1e-4)
@@ -226,8 +226,8 @@ def test_ends_and_rewards_of_many_episodes() -> None:
 
 def test_a_lost_vehicle_stays_where_it_was_lost() -> None:
     """Whatever it does next: the way back is closed, and a place there that reads like the destination is none."""
-    tasks = Tasks(places((-0.1, 165.0), (-5.0, 165.0)), places((-0.01, 165.0), (-8.0, 165.0)))
-    env = make(2, tasks=tasks, margin_deg=0.0, max_turn_deg=180.0, zeta=2.9)
+    trips = Trips(places((-0.1, 165.0), (-5.0, 165.0)), places((-0.01, 165.0), (-8.0, 165.0)))
+    env = make(2, trips=trips, margin_deg=0.0, max_turn_deg=180.0, zeta=2.9)
     steps = fly(env, (20.0, 0.0), (50.0, math.pi), (50.0, 0.0), (50.0, 0.5))
     assert steps[0]["next", "objective"][0] < 2.9
     for step in steps:
@@ -285,7 +285,7 @@ def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Seeds and tasks
+# Seeds and trips
 
 
 SEEDED: dict[str, Any] = {"num_envs": 4, "max_steps": 5, "start_heading": "random"}
@@ -319,13 +319,13 @@ def test_random_headings_fill_the_circle() -> None:
     assert not torch.equal(heading, env.reset()["heading"])
 
 
-def test_vehicles_fly_frozen_tasks_in_turn_and_count_their_own_episodes() -> None:
+def test_vehicles_fly_frozen_trips_in_turn_and_count_their_own_episodes() -> None:
     latitude = -torch.arange(1.0, 6.0)
     start, target = (torch.stack((latitude, torch.full((5,), longitude)), -1) for longitude in (162.0, 166.0))
-    env, again = (make(2, tasks=Tasks(start, target)) for _ in range(2))
+    env, again = (make(2, trips=Trips(start, target)) for _ in range(2))
 
     def started(td: TensorDictBase) -> list[int]:
-        """Which tasks are flown, told by the latitude of the start and of the target."""
+        """Which trips are flown, told by the latitude of the start and of the target."""
         assert torch.equal(td["position"][:, 0], td["target_position"][:, 0])
         assert (td["target_position"][:, 1] == 166.0).all()
         return [round(-1 - x) for x in td["position"][:, 0].tolist()]
@@ -389,7 +389,7 @@ def test_a_field_that_does_not_cover_what_is_flown_is_refused() -> None:
 
 def test_the_limit_of_the_objective_limits_losses() -> None:
     """Away from the destination F grows from 3 to more than 3.1: the limit takes the rest of the loss."""
-    env = make(tasks=task(START, TARGET), objective_limit=3.1)
+    env = make(trips=trip(START, TARGET), objective_limit=3.1)
     assert fly(env, (50.0, 0.0))[0]["next", "reward"].item() == pytest.approx(-1.0, abs=1e-4)
 
 

@@ -361,7 +361,7 @@ def test_stable_baselines3_example(tmp_path: Path, monkeypatch) -> None:
     pytest.importorskip("stable_baselines3")
     monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
     example = load("docs/examples/sb3")
-    small = {"num_envs": 8, "total_timesteps": 80, "learning_starts": 60, "gradient_steps": 1, "eval_tasks": 4}
+    small = {"num_envs": 8, "total_timesteps": 80, "learning_starts": 60, "gradient_steps": 1, "eval_trips": 4}
     result = example.main(example.Config("sac", **small))
     assert result.keys() == {"success", "spl", "steps"}
     assert 1 <= result["steps"] <= 50

@@ -19,7 +19,7 @@ from magrl.envs import (
     Region,
     Regions,
     Scenario,
-    Tasks,
+    Trips,
     earth_scenario,
     planet_scenario,
 )
@@ -191,7 +191,7 @@ def test_a_vehicle_is_lost_beyond_the_margin_of_its_own_region() -> None:
     (edges, longitude), index = (scenario.region.latitude, scenario.region.longitude.mean(1)), torch.tensor([2, 0, 1])
     start = torch.stack((edges[:, 1], longitude), -1)[index]
     target = torch.stack((edges.mean(1), longitude), -1)[index]
-    env = make(3, scenario.with_tasks(Tasks(start, target, index)), start_heading="north")
+    env = make(3, scenario.with_trips(Trips(start, target, index)), start_heading="north")
     td, lost = env.reset(), []
     for _ in range(3):
         step = env.step(td.set("action", torch.tensor([50.0, 0.0]).expand(3, 2)))["next"]
@@ -282,7 +282,7 @@ BAD: list[tuple[Callable[[], object], str]] = [
     (lambda: planet_scenario(2, 0, distance_range_km=(4e3, 5e3)), "(4000.0, 5000.0): no two points of"),
     (lambda: Scenario(region=planets().region), "region holds 6 boxes, and field 1 expansions"),
     (lambda: Scenario(field=planets().field), "region holds 1 boxes, and field 6 expansions"),
-    (lambda: planets().with_tasks(Tasks(*planets().random_tasks(9, seed=0)[:2])), "lies outside Region("),
+    (lambda: planets().with_trips(Trips(*planets().random_trips(9, seed=0)[:2])), "lies outside Region("),
     (lambda: make(2, max_leg_km=900.0), "the field is not defined on all of Region("),
 ]
 

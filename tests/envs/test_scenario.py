@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from magrl import paper
-from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks, load_scenario, task_set
+from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Trips, load_scenario, trip_set
 from magrl.field import IGRF, RegionalField, elements_at
 
 AZORES = Region((36, 46), (-32, -22))
@@ -32,7 +32,7 @@ def test_the_default_scenario_is_the_papers_to_the_bit() -> None:
     one, other = (GeomagneticNavEnv(*given, num_envs=3, seed=0).rollout(1) for given in ((), (scenario,)))
     for key in ("field", "position"):
         assert torch.equal(one[key], other[key])
-    assert torch.equal(scenario.random_tasks(5, 1).target, task_set(5, 1).target)
+    assert torch.equal(scenario.random_trips(5, 1).target, trip_set(5, 1).target)
 
 
 def test_field_is_that_of_the_date_and_altitude() -> None:
@@ -62,15 +62,15 @@ def test_floors_are_25_km_of_travel_there() -> None:
 def test_replace_checks_anew_and_changes_nothing_else() -> None:
     values = {"region": AZORES, "date": "2026-07-01", "generation": 14, "altitude_km": 2.0, "margin_deg": 3.0}
     scenario = Scenario(**values, distance_range_km=(200.0, 400.0), objective_floors=None)
-    tasks = scenario.random_tasks(3, seed=0)
-    framed = scenario.with_tasks(tasks)
-    assert torch.equal(framed.tasks.start, tasks.start)
-    assert framed.with_tasks(None) == scenario
+    trips = scenario.random_trips(3, seed=0)
+    framed = scenario.with_trips(trips)
+    assert torch.equal(framed.trips.start, trips.start)
+    assert framed.with_trips(None) == scenario
     changed = framed.replace(altitude_km=5)
     assert changed.altitude_km == 5
     assert [changed.given(name) for name in ("altitude_km", "margin_deg", "max_leg_km")] == [5, 3.0, None]
     with pytest.raises(ValueError, match="lies outside"):
-        Scenario().with_tasks(tasks)
+        Scenario().with_trips(trips)
     with pytest.raises(ValueError, match="frozen"):
         scenario.altitude_km = 5.0
 
@@ -110,8 +110,8 @@ BAD_VALUES: list[tuple[str, object, str]] = [
     ("wings", 0.01, "unknown key 'wings': choose from max_steps, max_leg_km, max_turn_deg, zeta"),
     ("distance_range_km", (5000.0, 6000.0), "(5000.0, 6000.0): no two points of Region(latitude=(-10.0, 0.0)"),
     ("date", 2026.0, "2026-01-01T00:00:00 is outside IGRF-13, which is valid from 1900-01-01 to 2025-01-01"),
-    ("tasks", torch.zeros(9, 4), "tasks must be Tasks(start, target), each (M, 2) latitude and longitude [deg], got"),
-    ("names", ("a",), "names must hold one name for each of 0 tasks, got ('a',)"),
+    ("trips", torch.zeros(9, 4), "trips must be Trips(start, target), each (M, 2) latitude and longitude [deg], got"),
+    ("names", ("a",), "names must hold one name for each of 0 trips, got ('a',)"),
 ]
 
 
@@ -131,13 +131,13 @@ def test_an_own_field_needs_no_date_of_igrf() -> None:
 
 def test_a_destination_outside_needs_a_margin_that_the_error_gives() -> None:
     """Twelve degrees south of the region, and seven beyond the antimeridian from it."""
-    tasks = Tasks(places((-5.0, 165.0), (-5.0, 165.0)), places((-21.7, 165.0), (-5.0, -179.0)))
+    trips = Trips(places((-5.0, 165.0), (-5.0, 165.0)), places((-21.7, 165.0), (-5.0, -179.0)))
     with pytest.raises(ValueError, match=r"lies outside .*: raise margin_deg from 5 to at least 12$"):
-        Scenario(tasks=tasks)
-    env = GeomagneticNavEnv(Scenario(tasks=tasks, margin_deg=12), num_envs=2, seed=0)
+        Scenario(trips=trips)
+    env = GeomagneticNavEnv(Scenario(trips=trips, margin_deg=12), num_envs=2, seed=0)
     assert env.edge.contains(env.reset()["target_position"]).all()
     with pytest.raises(ValueError, match=r"to at least 11$"):
-        Scenario(tasks=Tasks(tasks.start[1:], tasks.target[1:]))
+        Scenario(trips=Trips(trips.start[1:], trips.target[1:]))
 
 
 TOML = """
@@ -161,12 +161,12 @@ start_heading = "random"
 latitude = [36, 46]
 longitude = [-32, -22]
 
-[[tasks]]
+[[trips]]
 name = "Ponta Delgada to \\".................."
 start = [37.74, -25.67]
 target = [39.45, -31.13]
 
-[[tasks]]
+[[trips]]
 start = [40, -30]
 target = [42, 332]
 """
@@ -188,10 +188,10 @@ def test_a_file_holds_all_of_a_scenario(tmp_path: Path) -> None:
         assert (str(scenario.date)[:10], scenario.generation, scenario.altitude_km) == ("2026-07-01", 14, 10.0)
         assert (scenario.distance_range_km, scenario.margin_deg) == ((200, 400), 4)
         assert scenario.objective_floors == (0.1, 0.3, 100)
-        assert scenario.names == ('Ponta Delgada to "..................', "task 2")
-        assert scenario.tasks is not None
-        assert scenario.tasks.start.flatten().tolist() == pytest.approx([37.74, -25.67, 40, -30], abs=1e-12)
-        assert scenario.tasks.target.flatten().tolist() == pytest.approx([39.45, -31.13, 42, -28], abs=1e-12)
+        assert scenario.names == ('Ponta Delgada to "..................', "trip 2")
+        assert scenario.trips is not None
+        assert scenario.trips.start.flatten().tolist() == pytest.approx([37.74, -25.67, 40, -30], abs=1e-12)
+        assert scenario.trips.target.flatten().tolist() == pytest.approx([39.45, -31.13, 42, -28], abs=1e-12)
     env = GeomagneticNavEnv(scenario, num_envs=3, seed=0)
     assert (env.max_steps, env.max_leg_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
     assert (env.max_turn_rad, env.arrival, env.scenario.radius_km) == (math.pi / 4, "distance", 30.0)
@@ -205,7 +205,7 @@ def test_defaults_of_a_file(tmp_path: Path) -> None:
     scenario = load_scenario(str(path))
     assert (scenario.generation, scenario.altitude_km, scenario.margin_deg) == (14, 0.0, 5.0)
     assert scenario.distance_range_km == (300, 500)
-    assert (scenario.tasks, scenario.names, scenario.objective_floors) == (None, (), None)
+    assert (scenario.trips, scenario.names, scenario.objective_floors) == (None, (), None)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
@@ -238,7 +238,7 @@ OPTIONAL = {*tomllib.loads(TOML).keys(), "name"} - {"region", "date"}
 
 @pytest.mark.parametrize(
     ("value", "taken"),
-    [(DROPPED, OPTIONAL), (None, {"objective_floors"}), ("x", {"name"}), ([], {"tasks"})]
+    [(DROPPED, OPTIONAL), (None, {"objective_floors"}), ("x", {"name"}), ([], {"trips"})]
     + [(value, set()) for value in (True, [[1, 2]], math.nan)],
     ids=range(7),
 )

@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from magrl import Anywhere, episode_measures, evaluate, evaluation_rollout, summarize
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Trips, named_trips
 from magrl.envs.measures import (
     Episode,
     bootstrap_interval,
@@ -37,14 +37,14 @@ from magrl.evaluation.episodes import (
     first_episode_mask,
     moved,
 )
-from magrl.evaluation.options import choose_tasks, first_tasks
+from magrl.evaluation.options import choose_trips, first_trips
 from magrl.navigators import FieldPolicy, PolicyConfig, Secant, policy_env
 
 
-def test_every_task_is_flown_once_with_errors_of_its_own() -> None:
-    """The same task has other noise and another start heading for each vehicle; the same call has the same."""
-    tasks = named_tasks("figure-4-1")
-    thrice = Scenario().with_tasks(Tasks(tasks.start.repeat(3, 1), tasks.target.repeat(3, 1)))
+def test_every_trip_is_flown_once_with_errors_of_its_own() -> None:
+    """The same trip has other noise and another start heading for each vehicle; the same call has the same."""
+    trips = named_trips("figure-4-1")
+    thrice = Scenario().with_trips(Trips(trips.start.repeat(3, 1), trips.target.repeat(3, 1)))
     for options in ({"errors": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
         one, again = (evaluate("secant", thrice, max_steps=5, **options)["smoothness_deg"] for _ in range(2))
         assert torch.equal(one, again)
@@ -57,14 +57,14 @@ def test_every_task_is_flown_once_with_errors_of_its_own() -> None:
 @pytest.mark.parametrize("known", [{}, {"model": "IGRF-13", "start_km": 5.0}])
 def test_elements_at_the_destination_have_the_errors_that_vehicles_state(known: dict) -> None:
     """Whether they know the start or not; without D, that of D is none, and exact elements are as without errors."""
-    std, tasks = (0.1, 0.05, 30.0), named_tasks("paper-100")
+    std, trips = (0.1, 0.05, 30.0), named_trips("paper-100")
     for north, signs in (("true", [1, 1, 1]), ("magnetic", [0, 1, 1])):
-        flight = Flight(Scenario().with_tasks(tasks), north=north, target_std=std, **known)
+        flight = Flight(Scenario().with_trips(trips), north=north, target_std=std, **known)
         error = flight.env.reset()["target_error"]
         assert error.std(0) == pytest.approx(torch.tensor(std) * torch.tensor(signs), rel=0.25)
         assert flight.navigator("kalman").rules.target_std == std
     for none in ((0.0, 0.0, 0.0), None):
-        assert "target_error" not in Flight(Scenario().with_tasks(tasks), target_std=none, **known).env.reset()
+        assert "target_error" not in Flight(Scenario().with_trips(trips), target_std=none, **known).env.reset()
 
 
 def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
@@ -88,22 +88,22 @@ def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
 def test_what_cannot_be_evaluated_is_refused() -> None:
     agent = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
     elsewhere = Scenario(region={"latitude": (40, 50), "longitude": (0, 10)}, objective_floors=None)
-    elsewhere = elsewhere.with_tasks(elsewhere.random_tasks(2, seed=0))
-    for policy, tasks, options, message in (
-        ("secant", Scenario(), {}, "the scenario has no tasks to fly"),
+    elsewhere = elsewhere.with_trips(elsewhere.random_trips(2, seed=0))
+    for policy, trips, options, message in (
+        ("secant", Scenario(), {}, "the scenario has no trips to fly"),
         ("secant", "figure-4-1", {"errors": "yacht"}, "conditions must be one of 'laboratory'"),
         (agent, elsewhere, {}, "trained"),
         (agent, "figure-4-1", {"max_turn_deg": 20}, "up to 90°, the environment .* and 20°"),
         (5, "figure-4-1", {}, "policy must be callable"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
-            evaluate(policy, tasks, **options)
+            evaluate(policy, trips, **options)
 
 
 @pytest.mark.parametrize("options", [{"arrival": "declared"}, {"max_leg_km": 20, "zeta": 0.02}])
 def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
     """Within the limits of the environment, which it gets from `evaluate`, or from a loop of one's own."""
-    scenario = first_tasks(choose_tasks(None, "paper-100"), 3)
+    scenario = first_trips(choose_trips(None, "paper-100"), 3)
     policy, options = Anywhere(), {"max_steps": 4, **options}
     named, given = (evaluate(agent, scenario, errors=(0.05, 0.05, 5.0), **options) for agent in ("anywhere", policy))
     assert all(torch.equal(named[key], given[key]) for key in named.keys())  # noqa: SIM118
@@ -124,11 +124,11 @@ def test_a_vehicle_without_a_finite_action_fails_alone() -> None:
             action = super().forward(tensordict)["action"]
             return tensordict.set("action", torch.where(hurt, math.nan, action))
 
-    tasks = first_tasks(choose_tasks(None, "paper-100"), 6)
-    target = tasks.tasks.target[3]
+    trips = first_trips(choose_trips(None, "paper-100"), 6)
+    target = trips.trips.target[3]
     with pytest.warns(UserWarning, match=r"not finite: vehicles \[3\] stopped"):
-        episodes = evaluate(Broken(), tasks)
-    sound, others = evaluate("secant", tasks), torch.arange(6) != 3
+        episodes = evaluate(Broken(), trips)
+    sound, others = evaluate("secant", trips), torch.arange(6) != 3
     assert not episodes["success"][3]
     for key in ("success", "length_km", "steps"):
         assert torch.equal(episodes[key][others], sound[key][others]), key
@@ -236,7 +236,7 @@ def test_summary_by_hand() -> None:
     episodes |= {"navigation_error_km": torch.tensor([10.0, 25.0]), "length_km": torch.tensor([500.0, 1000.0])}
     episodes |= {"spl": torch.tensor([0.8, 0.0]), "path_efficiency": torch.tensor([0.75, math.nan])}
     summary = summarize(episodes)
-    expected = {"success_rate": 50, "success_rate_within_10km": 50, "success_rate_within_25km": 100, "num_tasks": 2}
+    expected = {"success_rate": 50, "success_rate_within_10km": 50, "success_rate_within_25km": 100, "num_trips": 2}
     expected |= {"trajectory_length_m": 500_000, "steps": 10, "navigation_error_km": 10, "spl": 40}
     expected |= {"spl_low": 0, "spl_high": 80} | {f"path_efficiency{end}": 75 for end in ("", "_low", "_high")}
     assert {key: summary[key] for key in expected} == pytest.approx(expected)
@@ -319,7 +319,7 @@ def test_navigators_fly_running_episodes_alone(name: str) -> None:
     """As they do among those that have ended, with their memory and the errors of each vehicle."""
     told = {"errors": (0.05, 0.05, 5.0), "seed": 1, "max_steps": 30}
     told |= {"arrival": "declared", "model": "IGRF-13", "start_km": 5.0} if name == "dead_reckoning" else {}
-    flight = Flight(first_tasks(choose_tasks(None, "paper-100"), 6), **told)
+    flight = Flight(first_trips(choose_trips(None, "paper-100"), 6), **told)
     navigator, seen = flight.navigator(name), []
     hook = navigator.register_forward_pre_hook(lambda _, args: seen.append(len(args[0])))
     found = evaluation_rollout(flight.env_of(navigator), navigator)

@@ -9,7 +9,7 @@ import fly
 import pytest
 import torch
 
-from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_trips
 from magrl.errors import CONDITIONS
 from magrl.evaluation import Sheet
 from magrl.navigators import NAVIGATORS, FieldPolicy, PolicyConfig, save_policy
@@ -39,7 +39,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
-    evaluate.main([f"{run}", "secant", "pso", "--tasks", "4", "--max-steps", "3", "--out", str(out), *TARGET])
+    evaluate.main([f"{run}", "secant", "pso", "--trips", "4", "--max-steps", "3", "--out", str(out), *TARGET])
     return out
 
 
@@ -48,7 +48,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_summary_is_that_of_the_episodes_of_the_same_tasks(results: Path) -> None:
+def test_summary_is_that_of_the_episodes_of_the_same_trips(results: Path) -> None:
     summary = json.loads((results / "summary.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
     episodes = rows(results / "episodes.csv")
     assert len(episodes) == 3 * 4
@@ -73,14 +73,14 @@ def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
 def test_paths_and_settings_state_what_was_flown(results: Path) -> None:
     """The paper's example with the true field; a run is flown as it was trained."""
     starts = [r for r in rows(results / "paths.csv") if r["step"] == "0"]
-    state = GeomagneticNavEnv(Scenario().with_tasks(named_tasks("figure-4-1")), seed=0).reset()
+    state = GeomagneticNavEnv(Scenario().with_trips(named_trips("figure-4-1")), seed=0).reset()
     assert len(starts) == 3
     for row in starts:
         assert (float(row["latitude"]), float(row["longitude"])) == (-2.0, 162.0)
         assert [float(row[name]) for name in ("D", "I", "B_H")] == state["field"][0].tolist()
     settings = json.loads((results / "settings.json").read_text(encoding="utf-8"))
     assert settings["navigators"] == ["gg_td3_noise=noisy", "secant", "pso"]
-    expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
+    expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "trips_seed": 0}
     expected |= {"target_std": [0.01, 0.02, 3.0]}
     assert settings.items() >= expected.items()
 
@@ -89,7 +89,7 @@ OWN = """date = 2026-07-01
 zeta = 0.02
 arrival = "distance"
 region = {latitude = [36, 46], longitude = [-32, -22]}
-tasks = [
+trips = [
     {name = "far off", start = [37.74, -25.67], target = [53.5, -31.13]},
     {start = [40, -30], target = [42, 332]},
 ]
@@ -101,7 +101,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     path, out = tmp_path / "own.toml", tmp_path / "out"
     path.write_text(OWN, encoding="utf-8")
     config = {"scenario": path, "out": out}
-    with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
+    with pytest.raises(UsageError, match=r"own\.toml: trips: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
     options = {"margin_deg": 8.0, "max_steps": 8, "max_turn_deg": 120.0, "start_heading": "random"}
     own = load_scenario(path, margin_deg=8.0)
@@ -113,15 +113,15 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     config["rules"] = evaluate.ScenarioOptions(**options)
     evaluate.evaluate(evaluate.Config(names, **config))
     settings = json.loads((out / "settings.json").read_text(encoding="utf-8"))
-    assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 2}).items()
+    assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_trips": 2}).items()
     arrived = [row for row in rows(out / "episodes.csv") if row["success"] == "True"]
     assert max(float(row["navigation_error_km"]) for row in arrived) <= 25
     text = (out / "table.md").read_text(encoding="utf-8")
     assert "paper" not in text
     assert "Arrival: distance, within 25 km." in text
     for message, change in (
-        (r"run: .*trained where D is", {"tasks": "figure-4-1", "scenario": None}),
-        ("--tasks figure-4-1 lies in the paper's region", {"tasks": "figure-4-1"}),
+        (r"run: .*trained where D is", {"trips": "figure-4-1", "scenario": None}),
+        ("--trips figure-4-1 lies in the paper's region", {"trips": "figure-4-1"}),
     ):
         with pytest.raises(UsageError, match=message):
             evaluate.evaluate(evaluate.Config(names[:1], **(config | change | {"out": tmp_path / "other"})))
@@ -133,13 +133,13 @@ def test_bad_usage_is_refused_before_anything_is_flown(tmp_path, monkeypatch) ->
     for navigators, options, message in (
         ((), {}, "at least one navigator"),
         (("dowsing",), {}, "unknown navigator 'dowsing'"),
-        (("secant",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
-        (("secant",), {"tasks_seed": 7}, "--tasks-seed 7 needs a number of random tasks, such as --tasks 300"),
+        (("secant",), {"trips": 0}, "num_trips must be a whole number from 1 on, got 0"),
+        (("secant",), {"trips_seed": 7}, "--trips-seed 7 needs a number of random trips, such as --trips 300"),
         (("ga",), {"seed": -1}, "seed"),
         (("secant",), {"device": "tpu"}, "device 'tpu' cannot be used here .*: choose another, such as cpu"),
         (("secant",), {"scenario": Path("missing.toml")}, "no scenario file at"),
     ):
-        given = {"tasks": None if "scenario" in options else "figure-4-1", "out": tmp_path / "out"} | options
+        given = {"trips": None if "scenario" in options else "figure-4-1", "out": tmp_path / "out"} | options
         with pytest.raises(UsageError, match=message):
             evaluate.evaluate(evaluate.Config(navigators, **given))
     assert not (tmp_path / "out").exists()

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, Trips
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.maps import coastlines, displacement_ellipse, trajectories_figure
 from magrl.geodesy import geodesic
@@ -30,8 +30,8 @@ def env() -> GeomagneticNavEnv:
 @pytest.fixture(scope="module")
 def flight() -> tuple[TensorDictBase, GeomagneticNavEnv]:
     """Return three legs of one vehicle across the antimeridian, with estimates of the destination."""
-    tasks = Tasks(place(-17, 179.999)[None], place(-14, -172)[None])
-    scenario = Scenario(region=Region((-25, -5), (170, 195)), tasks=tasks, objective_floors=None)
+    trips = Trips(place(-17, 179.999)[None], place(-14, -172)[None])
+    scenario = Scenario(region=Region((-25, -5), (170, 195)), trips=trips, objective_floors=None)
     base = GeomagneticNavEnv(scenario, seed=0, max_steps=3)
     return TransformedEnv(base, TrackField()).rollout(3, Geodesic()), base
 
@@ -47,7 +47,7 @@ def test_coastlines() -> None:
 
 
 def test_tracks_end_where_the_episode_did(env: GeomagneticNavEnv) -> None:
-    """One map for each navigator, at most three in a row, and the names of the tasks."""
+    """One map for each navigator, at most three in a row, and the names of the trips."""
     rollout = evaluation_rollout(env, Secant())
     assert len(trajectories_figure(dict.fromkeys("abcd", rollout), env.field, env.region).axes) == 4
     axes = trajectories_figure(rollout, env.field, env.region, episodes=2, names=["home", "port", "other"]).axes[0]

@@ -11,7 +11,7 @@ from support.networks import network_file
 from torchrl.envs import StepCounter, TransformedEnv
 
 from magrl import GeomagneticNavEnv, Region, Scenario, evaluate
-from magrl.evaluation.options import choose_tasks, first_tasks
+from magrl.evaluation.options import choose_trips, first_trips
 from magrl.navigators import NAVIGATORS, Anywhere, FieldPolicy, PolicyConfig, load_policy, policy_env, save_policy
 from magrl.navigators.names import KINDS, PRETRAINED, check_distinct, make_navigator, named, training_settings
 from magrl.navigators.quasi_newton import probe_length
@@ -133,7 +133,7 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
 
 def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment() -> None:
     limits = {"max_leg_km": 30, "max_turn_deg": 20, "max_steps": 80, "start_heading": "random"}
-    episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 3), **limits)
+    episodes = evaluate("anywhere", first_trips(choose_trips(None, "paper-100"), 3), **limits)
     assert episodes["success"].all()
     assert episodes["spl"].mean() > 0.95
 

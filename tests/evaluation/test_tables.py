@@ -25,7 +25,7 @@ def test_mean_of_runs_by_hand() -> None:
     assert 97 < low < middle == 98.5 < high < 100
 
 
-def test_worst_run_and_interval_over_tasks() -> None:
+def test_worst_run_and_interval_over_trips() -> None:
     assert cell([{"spl": 99.0}, {"spl": None}, {"spl": 98.456}], "worst", ".2f") == "98.46"
     assert cell([{"spl": 99.0}, {"spl": None}], "worst", ".2f") == cell([], "worst", ".2f") == "—"
     one = {"spl": 98.0, "spl_low": 97.5, "spl_high": 98.5, "steps": None}

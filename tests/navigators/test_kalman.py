@@ -14,7 +14,7 @@ import magrl
 from magrl.envs import GeomagneticNavEnv
 from magrl.errors import SensorErrors
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
-from magrl.evaluation.options import choose_tasks, first_tasks
+from magrl.evaluation.options import choose_trips, first_trips
 from magrl.navigators import Anywhere, Kalman, policy_env
 from magrl.pilot import Rules
 from magrl.pilot.network import correction_network, pretrained
@@ -30,7 +30,7 @@ def test_an_untrained_correction_is_the_leg_of_kalman() -> None:
 
 @pytest.mark.parametrize("name", ["anywhere", "kalman", "secant"])
 def test_every_navigator_declares(name: str) -> None:
-    summary = summarize(evaluate(name, first_tasks(choose_tasks(None, "paper-100"), 3), arrival="declared"))
+    summary = summarize(evaluate(name, first_trips(choose_trips(None, "paper-100"), 3), arrival="declared"))
     assert summary["success_rate"] == 100
     assert summary["spl"] > 80
 

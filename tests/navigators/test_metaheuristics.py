@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from magrl import guidance
-from magrl.envs import GeomagneticNavEnv, Scenario, task_set
+from magrl.envs import GeomagneticNavEnv, Scenario, trip_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_at
 from magrl.geodesy import move
@@ -29,7 +29,7 @@ every_algorithm = pytest.mark.parametrize("name", ["afsa", "ga", "pso"])
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(tasks=task_set(8, seed=81, distance_range_km=(100, 200))), num_envs=8, seed=0)
+    return GeomagneticNavEnv(Scenario(trips=trip_set(8, seed=81, distance_range_km=(100, 200))), num_envs=8, seed=0)
 
 
 def made(kind: type[Metaheuristic], **numbers: float) -> Metaheuristic:
@@ -115,7 +115,7 @@ def test_fish_follows_its_better_neighbor_and_no_farther_than_its_step() -> None
 
 @every_algorithm
 def test_look_ahead_is_an_oracle_that_arrives(env, name: str) -> None:
-    env.set_seed(0)  # back to each vehicle's first task
+    env.set_seed(0)  # back to each vehicle's first trip
     navigator = NAVIGATORS[name].for_env(env, seed=0)
     summary = summarize(episode_measures(evaluation_rollout(env, navigator)))
     assert summary["success_rate"] >= 85

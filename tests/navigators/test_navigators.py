@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from magrl.envs import GeomagneticNavEnv, Region, Scenario, task_set
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, trip_set
 from magrl.errors import Conditions, SensorErrors, with_conditions
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_gradient_at
@@ -28,14 +28,14 @@ from magrl.sensor_std import STD_KEYS
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(tasks=task_set(30, seed=71)), num_envs=30, seed=0)
+    return GeomagneticNavEnv(Scenario(trips=trip_set(30, seed=71)), num_envs=30, seed=0)
 
 
 NOISE = (0.05, 0.05, 5.0)
 
 
 def flown(env: GeomagneticNavEnv, navigator) -> dict[str, float]:
-    env.set_seed(0)  # back to each vehicle's first task
+    env.set_seed(0)  # back to each vehicle's first trip
     return summarize(episode_measures(evaluation_rollout(env, navigator)))
 
 
@@ -91,7 +91,7 @@ def test_a_navigator_flies_about_the_shortest_path(env, name: str, spl: float, s
 def test_parallel_and_secant_arrive_where_a_pair_fails() -> None:
     """In the Arabian Sea the gradients of D and I are parallel along a line."""
     scenario = Scenario(region=Region((4, 14), (66, 76)), objective_floors=None)
-    scenario = scenario.with_tasks(scenario.random_tasks(40, seed=1))
+    scenario = scenario.with_trips(scenario.random_trips(40, seed=1))
     sea = GeomagneticNavEnv(scenario, num_envs=40, seed=0)
     assert flown(sea, Secant(elements=("D", "I")))["success_rate"] < 90
     assert flown(sea, ParallelApproach(sea.field))["success_rate"] == 100
@@ -99,7 +99,7 @@ def test_parallel_and_secant_arrive_where_a_pair_fails() -> None:
 
 
 def test_secant_on_two_elements_and_narrow_turns() -> None:
-    env = GeomagneticNavEnv(Scenario(tasks=task_set(20, seed=72)), num_envs=20, seed=0, max_turn_deg=math.degrees(1.0))
+    env = GeomagneticNavEnv(Scenario(trips=trip_set(20, seed=72)), num_envs=20, seed=0, max_turn_deg=math.degrees(1.0))
     assert flown(env, Secant(50.0, 1.0, elements=("D", "I")))["success_rate"] >= 98
 
 

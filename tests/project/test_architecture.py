@@ -79,7 +79,7 @@ def test_no_cycle_among_modules() -> None:
 
 OTHER_MEANINGS = {"journal.Options.arrival", "tracks.Track.max_steps", "offline_dataset.Config.max_steps"}
 OTHER_MEANINGS |= {"fly.Config.max_steps", "fly.Config.zeta", "fly.Config.start_heading"}
-"""What a vehicle alone can do, frozen tasks, and defaults that follow from a flight."""
+"""What a vehicle alone can do, frozen trips, and defaults that follow from a flight."""
 
 
 def declarations(names: set[str]) -> set[str]:

@@ -28,7 +28,7 @@ VALUES: dict[str, Any] = {
     "price_range": (0.1, 1.0),
     "name": "marine",
     "uniform": torch.zeros(12),
-    "num_tasks": 2,
+    "num_trips": 2,
     "gauss": torch.ones(2, 2, dtype=torch.complex128),
     "date": "2026-07-01",
     "weight": 1.0,

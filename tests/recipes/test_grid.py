@@ -43,7 +43,7 @@ def test_bad_usage(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for tables, changes, message in (
         (("mars",), {}, "declares no table mars: choose from"),
-        (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
+        (("earth",), {"navigators": ("dowsing",), "trips": 2}, "earth: unknown navigator 'dowsing'"),
         (("comparison",), {"navigators": ("secant",), "jobs": 2}, "comparison: .* unexpected keyword argument 'jobs'"),
         (("noise",), {}, "there is no runs/.*: train it by make tables"),
     ):
@@ -87,8 +87,8 @@ def few_regions(monkeypatch) -> None:
     )
 
 
-NEAR = {"tasks": 4, "distance_km": (100, 150), "max_steps": 4}
-"""Tasks of three legs."""
+NEAR = {"trips": 4, "distance_km": (100, 150), "max_steps": 4}
+"""Trips of three legs."""
 
 
 def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
@@ -100,7 +100,7 @@ def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
     assert table[3][0] == "Kalman (dual control), step price 30.0"
     assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
     assert table[4][5].strip("*").startswith("+")
-    options = {"levels": [(0, 0, 0)], "tasks": 2}
+    options = {"levels": [(0, 0, 0)], "trips": 2}
     assert rows(grid.flights([oracle], **options, max_steps=1).text)[2][5] == "0.0 / 0.0"
     far = rows(grid.flights([oracle], **options, distance_km=(1200, 1300), max_steps=30).text)
     assert far[2][5] == "100.0 / 100.0"
@@ -110,7 +110,7 @@ def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, mon
     few = replace(tracks.TRACKS["vehicles-v3"], **NEAR, conditions=["ship"])
     monkeypatch.setitem(tracks.TRACKS, "vehicles-v3", few)
     for confidence, ends in ((0.0, "100.0 ± 0.0 / 0.0 ± 0.0"), (1.0, "0.0 ± 0.0 / 0.0 ± 0.0")):
-        grid.make(("confidence",), navigators=("geodesic",), tasks=2, confidence=confidence, out=tmp_path / "new")
+        grid.make(("confidence",), navigators=("geodesic",), trips=2, confidence=confidence, out=tmp_path / "new")
         head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
         assert head == [*flights.ABOUT, "ship"]
         assert row[5] == ends
@@ -120,7 +120,7 @@ def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, mon
 def test_columns_say_what_a_navigator_knows(monkeypatch) -> None:
     """Elements of the vehicle's own model tell it nothing of its destination, and do not count as measured."""
     std = (0.1, 0.05, 30.0)
-    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights.of(tasks=2, max_steps=2, target_std=std)
+    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights.of(trips=2, max_steps=2, target_std=std)
     measured, own = {"name": "secant", **told}, {"name": "secant", **told, "target_std": flights.OWN_MODEL}
     exact, mine = measured | {"target_std": [0, 0, 0]}, {"name": "kalman", "model": "IGRF-13"}
     assert [flights.names(spec, made.sheet)[2:] for spec in (measured, own, exact, mine, "kalman", "geodesic")] == [
@@ -157,11 +157,11 @@ def test_differences_are_of_correct_arrivals_where_cells_are() -> None:
 def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -> None:
     few = replace(tracks.TRACKS["north-v1"], **NEAR, levels=[(0, 0, 0), (0.05, 0.05, 5.0)])
     monkeypatch.setitem(tracks.TRACKS, "north-v1", few)
-    grid.make(("north-declared",), navigators=("secant", "geodesic"), tasks=3, out=tmp_path)
+    grid.make(("north-declared",), navigators=("secant", "geodesic"), trips=3, out=tmp_path)
     table = rows((tmp_path / "north-declared.md").read_text(encoding="utf-8"))
     episodes = read_episodes(tmp_path / "north-declared.csv.gz")
     assert set(episodes["track"]) == {"north-v1"}
-    assert episodes["task"].tolist() == 4 * [0, 1, 2]
+    assert episodes["trip"].tolist() == 4 * [0, 1, 2]
     ends = episodes.groupby(["navigator", "level"])[["success", "spl"]].mean() * 100
     for name, _, _, _, _, *cells in table[2:4]:
         for level, cell in zip(table[0][5:], cells, strict=True):
@@ -183,13 +183,13 @@ def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:
 
 
 def test_arrivals_have_intervals_that_are_clustered_by_region() -> None:
-    """By hand: in four regions of two tasks each, all or none of which succeed, the variance is 1 / 3 / 4."""
+    """By hand: in four regions of two trips each, all or none of which succeed, the variance is 1 / 3 / 4."""
     success, region = torch.tensor([1, 1, 0, 0, 1, 1, 0, 0]).bool(), torch.tensor([0, 0, 1, 1, 2, 2, 3, 3])
     assert flights.shown(50.0, success, region) == f"50.0 ± {196 * (1 / 12) ** 0.5:.1f}"
 
 
 def test_the_interval_of_a_difference_is_clustered_by_region() -> None:
-    """Four regions of two equal tasks each are four observations, whose mean has a variance of 20 / 3 / 4."""
+    """Four regions of two equal trips each are four observations, whose mean has a variance of 20 / 3 / 4."""
     first = torch.tensor([1.0, 1.0, 3.0, 3.0, 5.0, 5.0, 7.0, 7.0]) / 100
     region = torch.tensor([0, 0, 1, 1, 2, 2, 3, 3])
     assert flights.paired_difference(first, 0 * first, region) == "**+4.0 (+1.5 to +6.5)**"
@@ -225,7 +225,7 @@ def test_each_error_has_a_line_for_each_navigator(monkeypatch) -> None:
 
 def test_the_mean_of_a_cell_has_an_interval_clustered_by_region() -> None:
     flown = SimpleNamespace(episodes=lambda *_: [{"spl": torch.tensor([1.0, 0.8, 0.9])}])
-    flown.scenario = SimpleNamespace(tasks=SimpleNamespace(region=torch.tensor([0, 1, 1])))
+    flown.scenario = SimpleNamespace(trips=SimpleNamespace(region=torch.tensor([0, 1, 1])))
     mean, half = figures.mean_spl(flown, "secant", None)
     assert mean == pytest.approx(90)
     assert half == pytest.approx(1.96 * 20 / 3)
@@ -240,7 +240,7 @@ def test_the_reliability_diagram_has_a_panel_for_noise_and_one_for_vehicles(monk
 
 
 def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) -> None:
-    """Both are of the validation tasks."""
+    """Both are of the validation trips."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figures, "declared", lambda _: {"learning": {"gg_td3": "runs/guided*", "td3": "runs/plain*"}})
     for run, last in (("guided", 90), ("plain-seed0", 80), ("plain-seed1", 60)):
@@ -262,7 +262,7 @@ def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("evaluate.trajectories_figure", lambda *_, **__: Figure())
     navigators = ["secant", "parallel"]
-    table = grid.evaluation(navigators, folder=Path("runs/comparison"), tasks=3)
+    table = grid.evaluation(navigators, folder=Path("runs/comparison"), trips=3)
     assert [list(episodes) for episodes in table.episodes] == [list(COLUMNS)]
     assert len(table.episodes[0]) == 6
     assert [row[0] for row in rows(table.text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]

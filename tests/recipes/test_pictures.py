@@ -28,15 +28,15 @@ def test_pictures_show_the_published_data(path) -> None:
         assert picture.info.get("Description") == (flights.digest(DOCS / data) if data else None)
 
 
-def trip(*believed: float) -> pictures.Trip:
+def voyage(*believed: float) -> pictures.Voyage:
     """Three places on a meridian, a degree apart, and what the vehicle believes instead."""
     true = torch.tensor([[0.0, 50.0], [1.0, 50.0], [2.0, 50.0]]).double()
     places = torch.tensor([[place, 50.0] for place in believed]).double()
-    return pictures.Trip(true, places, 25.0 * torch.eye(2).double().expand(3, 2, 2))
+    return pictures.Voyage(true, places, 25.0 * torch.eye(2).double().expand(3, 2, 2))
 
 
 def test_a_trip_moves_between_its_steps_and_stays_at_its_end() -> None:
-    flown = trip(0.0, 1.5, 2.5)
+    flown = voyage(0.0, 1.5, 2.5)
     assert flown.at(1.5).true[:, 0].tolist() == [0, 1, 1.5]
     assert flown.at(1.5).believed[-1].tolist() == [2, 50]
     assert flown.at(9) is flown
@@ -45,7 +45,7 @@ def test_a_trip_moves_between_its_steps_and_stays_at_its_end() -> None:
 
 def test_the_counter_shows_the_step_before(monkeypatch) -> None:
     monkeypatch.setattr(pictures, "PIECE_KM", 60.0)
-    shown = pictures.Animation(torch.tensor([3.0, 50.0]).double(), trip(0.0, 1.5, 2.5), trip(0.0, 1.1, 2.0))
+    shown = pictures.Animation(torch.tensor([3.0, 50.0]).double(), voyage(0.0, 1.5, 2.5), voyage(0.0, 1.1, 2.0))
     frames = list(shown.frames("98 of 100"))
     assert len(frames) == 2 * 2 + 2
     assert (np.asarray(frames[-1]) != np.asarray(frames[-2])).any()

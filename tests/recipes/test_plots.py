@@ -5,7 +5,7 @@ import math
 import plots
 import pytest
 
-from magrl.envs import named_tasks
+from magrl.envs import named_trips
 from magrl.field import IGRF
 
 
@@ -19,14 +19,14 @@ def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
     assert len(axes.lines) == 3
 
 
-def test_figures_of_the_example_task() -> None:
+def test_figures_of_the_example_trip() -> None:
     """The destination is a dashed line in each element; steps are counted from the first."""
-    task, values = named_tasks("figure-4-1"), {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0]}
-    panels = plots.convergence({"secant": values | {"L": [0.0, 50.0]}}, IGRF("2022-01-01"), task).axes
+    trip, values = named_trips("figure-4-1"), {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0]}
+    panels = plots.convergence({"secant": values | {"L": [0.0, 50.0]}}, IGRF("2022-01-01"), trip).axes
     assert [len(axes.lines) for axes in panels] == [2, 2, 2, 1]
     assert panels[3].lines[0].get_xydata().tolist() == [[1, 50]]
     assert panels[1].lines[1].get_ydata()[0] == pytest.approx(-26.92, abs=0.1)
-    lines = plots.compared_trajectories({"secant": ([-2.0, -9.0], [162.0, 164.0])}, IGRF("2022-01-01"), task).axes[0]
+    lines = plots.compared_trajectories({"secant": ([-2.0, -9.0], [162.0, 164.0])}, IGRF("2022-01-01"), trip).axes[0]
     shown = {line.get_label(): line.get_xydata() for line in lines.lines}
     assert shown["secant"].tolist() == [[162, -2], [164, -9]]
     assert shown["start"].tolist() == [[162, -2]]

@@ -70,8 +70,8 @@ def test_the_vehicle_is_that_of_the_settings() -> None:
     drift = (true_leg - leg)[..., 0].abs() / leg[..., 0]
     assert 0.05 < drift.max() < 0.2 + 1e-5
     path_km = true_leg[..., 0].cumsum(1)
-    task_km = geodesic(*td["start_position"].unbind(-1), *td["target_position"].unbind(-1))[0]
-    best = task_km / (path_km + td["true_displacement"].norm(dim=-1))
+    trip_km = geodesic(*td["start_position"].unbind(-1), *td["target_position"].unbind(-1))[0]
+    best = trip_km / (path_km + td["true_displacement"].norm(dim=-1))
     torch.testing.assert_close(td["highest_spl"].squeeze(-1).double(), best.clamp(max=1), rtol=1e-4, atol=1e-4)
 
 
@@ -99,7 +99,7 @@ def test_only_the_spectrum_of_the_earth_is_trained_on(tmp_path, monkeypatch) -> 
     monkeypatch.setattr("magrl.field.igrf.igrf_coefficients", refuse)  # of IGRF as a field model
     monkeypatch.setattr(recipe, "earth_scenario", without_earth)
     recipe.train(small(recipe, tmp_path / "run", total_frames=64, max_steps=3))
-    assert seeds == [TEST_SEED]  # the test tasks alone are on Earth
+    assert seeds == [TEST_SEED]  # the test trips alone are on Earth
 
 
 def test_presets() -> None:

@@ -74,7 +74,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "scenario.toml", "trajectories.png"}
     assert with_paths(whole) == []
     written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
-    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, TEST_SEED, 192)
+    assert (written["num_trips"], written["trips_seed"], written["frames"]) == (6, TEST_SEED, 192)
     assert written["spl"] == result["spl"]
     assert config["recipe"] == module.RECIPE
     assert tuple(config.get("noise", NOISE)) == NOISE
@@ -121,7 +121,7 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
 def test_training_in_eddies(tmp_path: Path, monkeypatch) -> None:
     """Its policy gets its last legs from the map of any environment of one region, and acts as in training."""
     few_steps(monkeypatch, 8, "eddies")
-    options = {"reward": "progress", "total_frames": 64, "eval_every": 4, "eval_tasks": 2, "eval_tasks_small": 2}
+    options = {"reward": "progress", "total_frames": 64, "eval_every": 4, "eval_trips": 2, "eval_trips_small": 2}
     recipe.train(small(recipe, tmp_path / "run", task="eddies", **options))
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
     make = partial(eddies_env, 8, max_steps=8, seed=1)
@@ -132,7 +132,7 @@ def test_training_in_eddies(tmp_path: Path, monkeypatch) -> None:
     assert torch.equal(flown["next", "recent_legs"], trained["next", "observation"])
     assert len(evaluate(policy, "figure-4-1", max_steps=2)) == 1
     with pytest.raises(ValueError, match="a map is of one region, got 3"):
-        evaluate(policy, planet_scenario(3, seed=0).with_tasks(planet_scenario(3, seed=0).random_tasks(2, seed=0)))
+        evaluate(policy, planet_scenario(3, seed=0).with_trips(planet_scenario(3, seed=0).random_trips(2, seed=0)))
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys, m
     assert "episode/s" in text.err
     assert f"Warning: no gradient step was made in {result['frames']} frames" in text.err
     assert math.isnan(result["steps"])
-    assert "6 test tasks: success rate 0.0 %, SPL 0.0 %, no episode arrived\n" in text.out
+    assert "6 test trips: success rate 0.0 %, SPL 0.0 %, no episode arrived\n" in text.out
     assert not re.search(r"\bnan\b", text.out + text.err)
 
 

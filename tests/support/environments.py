@@ -10,7 +10,7 @@ from functools import cache
 import torch
 from torchrl.envs import EnvBase, ParallelEnv
 
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Trips
 from magrl.field import FieldModel
 from magrl.geodesy import move
 
@@ -30,7 +30,7 @@ def near(*distances_km: float, rule: str = "declared", **options: object) -> Geo
     start = torch.tensor([[-5.0, 165.0]], dtype=torch.float64).expand(len(distances_km), 2)
     reach = torch.tensor(distances_km, dtype=torch.float64)
     target = torch.stack(move(*start.unbind(-1), torch.zeros_like(reach), reach), -1)
-    scenario = Scenario(field=paper_field(), tasks=Tasks(start, target))
+    scenario = Scenario(field=paper_field(), trips=Trips(start, target))
     return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, radius_km=10.0, seed=0, **options)
 
 

@@ -37,8 +37,8 @@ SMALL = {
     "num_regions": 8,
     "max_steps": 5,
     "eval_every": 10,
-    "eval_tasks_small": 4,
-    "eval_tasks": 6,
+    "eval_trips_small": 4,
+    "eval_trips": 6,
     "wandb_mode": "disabled",
 }
 """Settings of a small training, as far as a recipe has them."""

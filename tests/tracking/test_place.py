@@ -141,11 +141,11 @@ def test_a_destination_out_of_reach_is_not_known() -> None:
 def scenario_of(latitude: float) -> Scenario:
     scenario = earth_scenario(4, 3, max_leg_km=90.0, max_latitude=latitude, distance_range_km=(300.0, 500.0))
     scenario = scenario.replace(max_leg_km=50.0, max_steps=15, arrival="declared", start_heading="random")
-    return scenario.with_tasks(scenario.random_tasks(6, 3))
+    return scenario.with_trips(scenario.random_trips(6, 3))
 
 
 def test_a_model_and_a_start_beat_dead_reckoning() -> None:
-    told = {"tasks": scenario_of(70), "errors": "underwater", "model": "IGRF-13", "start_km": 5.0, "seed": 3}
+    told = {"trips": scenario_of(70), "errors": "underwater", "model": "IGRF-13", "start_km": 5.0, "seed": 3}
     share = [evaluate(name, **told)["success"].double().mean() for name in ("kalman", "dead_reckoning")]
     assert share[0] > share[1] + 0.15
 

@@ -35,10 +35,10 @@ def in_run(config: RegionConfig) -> Run:
 
 def train(folder: Path, width: int = 1, **options: object) -> None:
     """A training whose agent flies at random and learns nothing."""
-    options = {"total_frames": 12, "eval_every": 2, "log_every": 2, "eval_tasks_small": 2, "eval_tasks": 2} | options
+    options = {"total_frames": 12, "eval_every": 2, "log_every": 2, "eval_trips_small": 2, "eval_trips": 2} | options
     with in_run(RegionConfig(out=folder, wandb_mode="disabled", **options)) as run:
         torch.manual_seed(run.config.seed)
-        base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=2, seed=0, max_steps=2)
+        base = GeomagneticNavEnv(run.scenario.with_trips(None), num_envs=2, seed=0, max_steps=2)
         validation, test = run.evaluation_envs(navigation_env, max_steps=2, zeta=2.9)
         policy = FieldPolicy(PolicyConfig(base.observation_view(), (8,)))
         collector = Collector(base, base.rand_action, frames_per_batch=2, total_frames=12, track_traj_ids=False)
@@ -93,7 +93,7 @@ def test_run_is_named_after_its_scenario_and_noise() -> None:
 
 def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
     for noise, share in ((NOISE, 1.0), ((0.0, 0.0, 0.0), 0.0)):
-        with in_run(RegionConfig(out=tmp_path / f"run{share}", noise=noise, eval_tasks=6, eval_tasks_small=4)) as run:
+        with in_run(RegionConfig(out=tmp_path / f"run{share}", noise=noise, eval_trips=6, eval_trips_small=4)) as run:
             states = [env.reset() for env in run.evaluation_envs(navigation_env, zeta=0.01)]
         errors = [state["field"] - state.get("true_field", state["field"]) for state in states]
         assert [(error != 0).double().mean().item() for error in errors] == [share, share]

@@ -87,7 +87,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for row in ROWS:
             log.row(row)
         log.figure("trajectories", Figure())
-        log.result({"spl": 97.5, "steps": float("nan"), "num_tasks": 3})
+        log.result({"spl": 97.5, "steps": float("nan"), "num_trips": 3})
         log.close()
     return folder
 

@@ -99,7 +99,7 @@ def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused() -> 
 
 
 def test_no_area_covers_a_start_or_a_destination() -> None:
-    """Of the shortest tasks, too."""
+    """Of the shortest trips, too."""
     env = no_go_env(64, seed=0, distance_range_km=(30.0, 120.0))
     centers, radii = NoGoAreas.discs(env.reset()["no_go_areas"])
     assert (centers.norm(dim=-1) > radii).all()

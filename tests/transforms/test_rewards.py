@@ -55,7 +55,7 @@ def test_displacement_leads_to_the_target(latitude: float) -> None:
 
 
 def test_highest_spl_by_hand() -> None:
-    """A task of 100 km: 60 km flown for 40 km of progress; then the arrival after 40 km more, or the end elsewhere."""
+    """A trip of 100 km: 60 km flown for 40 km of progress; then the arrival after 40 km more, or the end elsewhere."""
     start, target = torch.zeros(3, 2), torch.tensor([[0.0, 0.898315]]).expand(3, 2)
     flags = torch.tensor([[False], [True], [False]]), torch.tensor([[False], [True], [True]])
     after = TensorDict(

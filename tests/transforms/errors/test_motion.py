@@ -228,7 +228,7 @@ def test_the_compass_shows_the_measured_field() -> None:
 @pytest.mark.parametrize(("navigator", "noise"), [("kalman", NOISE), ("secant", NOISE), ("anywhere", (0.0,) * 3)])
 def test_navigators_fly_by_the_compass(navigator: str, noise: tuple[float, float, float]) -> None:
     scenario = Scenario(arrival="distance", start_heading="random", max_steps=9, distance_range_km=(100, 200))
-    scenario = scenario.with_tasks(scenario.random_tasks(4, 1))
+    scenario = scenario.with_trips(scenario.random_trips(4, 1))
     assert evaluate(navigator, scenario, errors=noise, north="magnetic")["success"].double().mean() > 0.7
 
 

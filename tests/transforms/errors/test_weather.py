@@ -9,7 +9,7 @@ from support.errors import flown, nav
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from magrl.envs import Scenario, named_tasks
+from magrl.envs import Scenario, named_trips
 from magrl.errors import CONDITIONS, Conditions, MagneticWeather
 from magrl.evaluation import Flight
 from magrl.field import WEATHER, WeatherRecord, weather_record
@@ -119,7 +119,7 @@ def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
     stated = []
     for longest, own in ((300.0, {}), (500.0, {}), (1800.0, {}), (1800.0, {"trip_km": 500.0})):
         ship = Conditions("ship", SHIP, {"weather": {"record": "quiet", "span_h": 200.0, **own}})
-        scenario = Scenario(distance_range_km=(100.0, longest), tasks=named_tasks("figure-4-1"))
+        scenario = Scenario(distance_range_km=(100.0, longest), trips=named_trips("figure-4-1"))
         stated.append(Flight(scenario, errors=ship).sensor_std.drift[2])
     assert stated == pytest.approx([12, 12, 32, 12], abs=0.5)
 

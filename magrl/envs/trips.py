@@ -1,6 +1,6 @@
-"""Tasks (start and destination): random ones from a counter-based generator, and frozen sets of them.
+"""Trips (start and destination): random ones from a counter-based generator, and frozen sets of them.
 
-A random task is a pure function of (seed, vehicle, episode). The tasks of a vehicle therefore depend neither on the
+A random trip is a pure function of (seed, vehicle, episode). The trips of a vehicle therefore depend neither on the
 batch size nor on when other vehicles are reset, they are the same on every device, and no generator state has to be
 saved to repeat them.
 """
@@ -22,11 +22,11 @@ from magrl.random_numbers import PAPER_SEED, TEST_SEED, counter_uniform
 
 TRIES_PER_ROUND = 8
 CHUNK = 16384
-"""Tasks drawn at a time, which keeps their tries in the cache."""
+"""Trips drawn at a time, which keeps their tries in the cache."""
 MAX_ROUNDS = 1000
 """Rounds of rejection sampling after which a region counts as too small for its distances."""
 SHORTEST_KM = 0.001
-"""Shortest distance from start to destination of a frozen task [km]."""
+"""Shortest distance from start to destination of a frozen trip [km]."""
 
 
 class _Columns(NamedTuple):
@@ -35,7 +35,7 @@ class _Columns(NamedTuple):
     region: Tensor
 
 
-class Tasks(_Columns):
+class Trips(_Columns):
     """Start and destination of episodes, and the index of their region.
 
     Args:
@@ -48,23 +48,23 @@ class Tasks(_Columns):
         ValueError: for positions of another shape.
 
     Example:
-        >>> Tasks(torch.tensor([[-2.0, 162.0]]), torch.tensor([[-8.0, 164.0]])).region
+        >>> Trips(torch.tensor([[-2.0, 162.0]]), torch.tensor([[-8.0, 164.0]])).region
         tensor([0])
     """
 
     __slots__ = ()
 
     def __new__(cls, start: Tensor, target: Tensor, region: Tensor | None = None) -> Self:
-        """Return tasks, by default in region 0."""
-        check_tensor(2, **{"tasks.start": start, "tasks.target": target})
+        """Return trips, by default in region 0."""
+        check_tensor(2, **{"trips.start": start, "trips.target": target})
         if region is None:
             region = torch.zeros(start.shape[:-1], dtype=torch.int64, device=start.device)
         return super().__new__(cls, start, target, region)
 
 
 DISTANCE_LAWS = ("area", "log")
-"""How random tasks draw their distance: ends uniform over the ring about the start, or log-uniform distances."""
-# Counters that separate these draws from the attempts at placing a task, which are counted from 0.
+"""How random trips draw their distance: ends uniform over the ring about the start, or log-uniform distances."""
+# Counters that separate these draws from the attempts at placing a trip, which are counted from 0.
 _HEADING_STREAM, _REGION_STREAM, _DISTANCE_STREAM = -1, -2, -3
 
 
@@ -97,44 +97,44 @@ def check_distance_range(regions: Regions, distance_range_km: tuple[float, float
         )
 
 
-def sample_tasks(
+def sample_trips(
     regions: Regions,
     distance_range_km: tuple[float, float],
     seed: int,
     vehicle: Tensor,
     episode: Tensor,
     distance_law: str = "area",
-) -> Tasks:
-    """Return random tasks: start and end uniform over a region, given that their distance is in the range.
+) -> Trips:
+    """Return random trips: start and end uniform over a region, given that their distance is in the range.
 
     Args:
-        regions: boxes, of which each task draws the one that holds both of its ends.
+        regions: boxes, of which each trip draws the one that holds both of its ends.
         distance_range_km: shortest and longest geodesic distance [km].
-        seed: seed of the whole family of tasks.
+        seed: seed of the whole family of trips.
         vehicle: ``(P,)`` int64, number of the vehicle.
         episode: ``(P,)`` int64, number of its episode.
         distance_law: ``"log"`` draws the distance first, log-uniform in the range, and then both ends, uniform given
             their distance, which is met to within 30 m up to 2000 km.
 
     Returns:
-        ``P`` tasks, each a function of (seed, vehicle, episode) alone.
+        ``P`` trips, each a function of (seed, vehicle, episode) alone.
 
     Raises:
         ValueError: for an invalid range, one that a region cannot hold, or a seed that is not a whole number.
-        RuntimeError: if no task is found because a region can hardly hold the distances.
+        RuntimeError: if no trip is found because a region can hardly hold the distances.
 
     Example:
         >>> number = torch.arange(4)
-        >>> tasks = sample_tasks(Regions.of(PAPER_REGION), (300, 500), 0, number, torch.zeros_like(number))
-        >>> d = geodesic(*tasks.start.unbind(-1), *tasks.target.unbind(-1))[0]
+        >>> trips = sample_trips(Regions.of(PAPER_REGION), (300, 500), 0, number, torch.zeros_like(number))
+        >>> d = geodesic(*trips.start.unbind(-1), *trips.target.unbind(-1))[0]
         >>> bool(((d >= 300) & (d <= 500)).all())
         True
     """
     check_distance_range(regions, distance_range_km, distance_law)
     if len(vehicle) > CHUNK:
         rows = zip(vehicle.split(CHUNK), episode.split(CHUNK), strict=True)
-        parts = [sample_tasks(regions, distance_range_km, seed, *some, distance_law) for some in rows]
-        return Tasks(*map(torch.cat, zip(*parts, strict=True)))
+        parts = [sample_trips(regions, distance_range_km, seed, *some, distance_law) for some in rows]
+        return Trips(*map(torch.cat, zip(*parts, strict=True)))
     counters = torch.stack((vehicle, episode), -1)
     region = (_draw(seed, counters, _REGION_STREAM) * len(regions)).long().squeeze(-1)
     radii_km = torch.tensor(distance_range_km, dtype=torch.float64, device=region.device).expand(len(region), 2)
@@ -155,9 +155,9 @@ def sample_tasks(
         start[waiting[placed]], target[waiting[placed]] = starts[chosen], ends[chosen]
         waiting = waiting[~placed]
         if not len(waiting):
-            return Tasks(start, target, region)
+            return Trips(start, target, region)
     raise RuntimeError(
-        f"no task was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {regions[int(region[waiting[0]])]} can hardly "
+        f"no trip was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {regions[int(region[waiting[0]])]} can hardly "
         f"hold distances of {distance_range_km} km"
     )
 
@@ -179,7 +179,7 @@ def _candidates(regions: Regions, region: Tensor, radii_km: Tensor, uniform: Ten
 
     Args:
         regions: boxes.
-        region: ``(P,)`` box of each task.
+        region: ``(P,)`` box of each trip.
         radii_km: ``(P, 2)`` inner and outer radius of the ring.
         uniform: ``(P, R, 4)`` in [0, 1).
     """
@@ -204,94 +204,94 @@ def random_headings(seed: int, vehicle: Tensor, episode: Tensor) -> Tensor:
     return wrap_angle(2 * math.pi * _draw(seed, torch.stack((vehicle, episode), -1), _HEADING_STREAM))
 
 
-def task_set(
-    num_tasks: int,
+def trip_set(
+    num_trips: int,
     seed: int,
     region: Region | Regions = PAPER_REGION,
     distance_range_km: tuple[float, float] = paper.DISTANCE_KM,
     distance_law: str = "area",
-) -> Tasks:
-    """Return a frozen set of tasks: the first episode of each of ``num_tasks`` vehicles; see :func:`sample_tasks`.
+) -> Trips:
+    """Return a frozen set of trips: the first episode of each of ``num_trips`` vehicles; see :func:`sample_trips`.
 
     Raises:
-        ValueError: for fewer than one task, or a range that the region cannot hold.
+        ValueError: for fewer than one trip, or a range that the region cannot hold.
 
     Example:
-        >>> task_set(100, seed=1).start.shape
+        >>> trip_set(100, seed=1).start.shape
         torch.Size([100, 2])
     """
-    check_number(1, whole=True, num_tasks=num_tasks)
+    check_number(1, whole=True, num_trips=num_trips)
     check_type((Region, Regions), region=region)
-    vehicle = torch.arange(num_tasks)
-    return sample_tasks(Regions.of(region), distance_range_km, seed, vehicle, torch.zeros_like(vehicle), distance_law)
+    vehicle = torch.arange(num_trips)
+    return sample_trips(Regions.of(region), distance_range_km, seed, vehicle, torch.zeros_like(vehicle), distance_law)
 
 
-def check_tasks(tasks: Tasks, within: Regions) -> Tasks:
-    """Return a copy of tasks in float64 with wrapped longitudes; raise unless all are valid.
+def check_trips(trips: Trips, within: Regions) -> Trips:
+    """Return a copy of trips in float64 with wrapped longitudes; raise unless all are valid.
 
     Args:
-        tasks: ``M`` tasks.
-        within: boxes; the box of a task must hold its start and target.
+        trips: ``M`` trips.
+        within: boxes; the box of a trip must hold its start and target.
 
     Raises:
         TypeError: for a region index that is not int64.
         ValueError: for other shapes, an empty set, positions that are not on Earth or outside ``within``, an index
-            without a region, or a task that starts at its destination.
+            without a region, or a trip that starts at its destination.
 
     Example:
-        >>> tasks = Tasks(torch.tensor([[-2.0, 522.0]]), torch.tensor([[-8.0, 164.0]]))
-        >>> check_tasks(tasks, within=Regions.of(PAPER_REGION)).start
+        >>> trips = Trips(torch.tensor([[-2.0, 522.0]]), torch.tensor([[-8.0, 164.0]]))
+        >>> check_trips(trips, within=Regions.of(PAPER_REGION)).start
         tensor([[ -2., 162.]], dtype=torch.float64)
     """
-    start, target, region = tasks.start.double(), tasks.target.double(), tasks.region
+    start, target, region = trips.start.double(), trips.target.double(), trips.region
     if start.shape != target.shape or start.ndim != 2 or not len(start):
         raise ValueError(
-            f"tasks must be two (M, 2) tensors with M >= 1, got {tuple(start.shape)} and {tuple(target.shape)}"
+            f"trips must be two (M, 2) tensors with M >= 1, got {tuple(start.shape)} and {tuple(target.shape)}"
         )
-    check_index(region, len(within), "tasks.region")
+    check_index(region, len(within), "trips.region")
     if region.shape != start.shape[:1]:
-        raise ValueError(f"tasks.region must hold {len(start)} indices, one a task, got {tuple(region.shape)}")
+        raise ValueError(f"trips.region must hold {len(start)} indices, one a trip, got {tuple(region.shape)}")
     for name, position in (("start", start), ("target", target)):
         check_positions(*position.unbind(-1))
         inside = within.contains(position, region).squeeze(-1)
         if not inside.all():
             number = int((~inside).nonzero()[0])
             raise ValueError(
-                f"the {name} of task {number} (the first is task 0), {position[number].tolist()}, lies outside "
+                f"the {name} of trip {number} (the first is trip 0), {position[number].tolist()}, lies outside "
                 f"{within[int(region[number])]}"
             )
     distance_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
     if (distance_km < SHORTEST_KM).any():
         number = int((distance_km < SHORTEST_KM).nonzero()[0])
         raise ValueError(
-            f"task {number} (the first is task 0) starts at its destination, {start[number].tolist()}: move one of "
-            "them, or remove the task"
+            f"trip {number} (the first is trip 0) starts at its destination, {start[number].tolist()}: move one of "
+            "them, or remove the trip"
         )
     start, target = (torch.stack((x[:, 0], wrap_longitude(x[:, 1])), -1) for x in (start, target))
-    return Tasks(start, target, region)
+    return Trips(start, target, region)
 
 
-TASK_SETS = ("test-1000", "paper-100", "figure-4-1")
-"""Frozen task sets: 1000 unseen tasks, the paper's 100, and its one task of Fig. 4-1."""
+TRIP_SETS = ("test-1000", "paper-100", "figure-4-1")
+"""Frozen trip sets: 1000 unseen trips, the paper's 100, and its one trip of Fig. 4-1."""
 
 RANDOM_SETS = {"test-1000": (1000, TEST_SEED), "paper-100": (100, PAPER_SEED)}
-"""Number of tasks and seed of each random set."""
+"""Number of trips and seed of each random set."""
 
 
-def named_tasks(name: str) -> Tasks:
-    """Return a frozen task set in the paper's region.
+def named_trips(name: str) -> Trips:
+    """Return a frozen trip set in the paper's region.
 
     Args:
-        name: one of :data:`TASK_SETS`.
+        name: one of :data:`TRIP_SETS`.
 
     Raises:
         ValueError: for another name.
 
     Example:
-        >>> named_tasks("figure-4-1").start
+        >>> named_trips("figure-4-1").start
         tensor([[ -2., 162.]], dtype=torch.float64)
     """
-    check_choice(TASK_SETS, tasks=name)
+    check_choice(TRIP_SETS, trips=name)
     if name in RANDOM_SETS:
-        return task_set(*RANDOM_SETS[name])
-    return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in (paper.EXAMPLE_START, paper.EXAMPLE_TARGET)))
+        return trip_set(*RANDOM_SETS[name])
+    return Trips(*(torch.tensor([end], dtype=torch.float64) for end in (paper.EXAMPLE_START, paper.EXAMPLE_TARGET)))
