@@ -109,8 +109,9 @@ def mutants(tree: Path, parts: list[str]) -> Iterator[tuple[Path, str, str]]:
 def caught(tree: Path, module: Path, after: str) -> bool:
     """Return whether tests fail with a module replaced."""
     before, part = module.read_text(encoding="utf-8"), module.relative_to(tree / "magrl").parts[0]
-    room = tree / "tests" / (part if (tree / "tests" / part).is_dir() else "ground")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(module), str(room)]
+    folder = tree / "tests" / part
+    rooms = [folder] if folder.is_dir() else sorted((tree / "tests").glob("test_*.py"))
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(module), *map(str, rooms)]
     environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     module.write_text(after, encoding="utf-8")
     try:

@@ -154,7 +154,7 @@ def test_agents_heed_all_errors_that_are_stated(kind: type[Kalman]) -> None:
 # Commands
 
 
-BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.toml"
+BOAT = Path(__file__).parent.parent.parent / "docs" / "examples" / "boat.toml"
 
 
 def test_own_errors_in_a_file() -> None:
