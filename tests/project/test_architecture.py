@@ -74,6 +74,44 @@ def test_no_cycle_among_modules() -> None:
         graph = {module: needs for module, needs in graph.items() if module not in free}
 
 
+# Additions
+
+
+ADDITIONS = (
+    "an error of a sensor",
+    "a named task",
+    "a navigator",
+    "a vehicle",
+    "a transform",
+    "a table",
+    "a figure",
+    "an option of what is known",
+    "a measure",
+    "a kind of policy file",
+)
+
+
+def test_an_addition_touches_at_most_two_files_and_a_page() -> None:
+    """All of which exist; a new file, NAME, stands in a folder that does."""
+    table = PAGE.partition("| to add | touch | page |\n")[2].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[1:]]
+    assert tuple(name for name, *_ in rows) == ADDITIONS
+    for name, touched, page in rows:
+        paths = re.findall(r"`([\w/]+/[\w.]+)`", touched)
+        pages = re.findall(r"\]\((\w+\.md)\)", page)
+        assert len(pages) == 1, name
+        assert 1 <= len(paths) <= 2, name
+        for path in (*(ROOT / path for path in paths), ROOT / "docs" / pages[0]):
+            assert (path.parent if path.stem == "NAME" else path).exists(), path
+
+
+def test_the_walk_of_a_step_names_files() -> None:
+    walk = PAGE.partition("## A step")[2].partition("\n## ")[0]
+    paths = set(re.findall(r"`(magrl/[\w/]+\.py)`", walk))
+    assert len(paths) > 5
+    assert [path for path in sorted(paths) if not (ROOT / path).is_file()] == []
+
+
 # Rules of an episode, and what a vehicle knows
 
 
