@@ -13,11 +13,11 @@ from magrl.errors.motion import MotionError as MotionError
 from magrl.errors.north import NORTH_REFERENCES as NORTH_REFERENCES
 from magrl.errors.north import NorthReferenceError as NorthReferenceError
 from magrl.errors.north import north_reference as north_reference
-from magrl.errors.place import KnownPlace as KnownPlace
 from magrl.errors.sensors import SensorErrors as SensorErrors
 from magrl.errors.sensors import sensor_levels as sensor_levels
 from magrl.errors.spikes import Spikes as Spikes
-from magrl.errors.target import TargetErrors as TargetErrors
+from magrl.errors.trip import KnownPlace as KnownPlace
+from magrl.errors.trip import TargetErrors as TargetErrors
 from magrl.errors.vector import VectorErrors as VectorErrors
 
 TRUE_KEYS = true_keys()
