@@ -188,8 +188,9 @@ def train(config: Config) -> dict[str, float]:
         validation, test = run.evaluation_envs(NAMED_TASKS[config.task].make, reward=reward, **config.options)
 
         # Networks
+        network = PolicyConfig(env.view, config.num_cells, config.layer_norm)
+        actor = network.make_actor(env.device)
         shape = {"layer_norm": config.layer_norm, "geometry": env.view.geometry}
-        actor = (network := PolicyConfig(env.view, config.num_cells, **shape)).make_actor(env.device)
         critic = make_critic(env.view.size, config.num_cells, **shape, device=env.device)
 
         # Loss, with clipped double Q and target policy smoothing

@@ -45,7 +45,6 @@ class PolicyConfig:
         view: what the policy observes, and its scaling: values scaled to a region, or plain readings.
         num_cells: width of each hidden layer; None for a network of another kind.
         layer_norm: whether hidden layers are normalized.
-        geometry: whether the first layer is :class:`~magrl.navigators.networks.AreaGeometry`.
 
     Raises:
         TypeError: for a view of another type.
@@ -61,7 +60,6 @@ class PolicyConfig:
     view: View
     num_cells: tuple[int, ...] | None
     layer_norm: bool = True
-    geometry: bool = False
 
     def __post_init__(self) -> None:
         check_type(tuple(VIEWS.values()), view=self.view)
@@ -74,7 +72,7 @@ class PolicyConfig:
             raise ValueError(
                 f"num_cells must be the widths of the hidden layers with {type(self.view).__name__}, got None"
             )
-        shape = {"layer_norm": self.layer_norm, "geometry": self.geometry}
+        shape = {"layer_norm": self.layer_norm, "geometry": self.view.geometry}
         return make_actor(self.view.size, self.num_cells, **shape, device=device)
 
 
