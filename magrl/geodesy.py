@@ -210,7 +210,7 @@ def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
 
 
 def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the end of a short leg at a heading (Eq. 2-3 on the ellipsoid).
+    """Return the end of a short leg at a heading (Eq. (3) on the ellipsoid).
 
     The path is the circle that osculates the geodesic at its start, with Euler's radius for that heading. It is
     within 5 mm of the geodesic at 50 km and within 5 m at 500 km, and works at the poles and across the

@@ -20,11 +20,11 @@ from magrl.field.elements import element_difference
 from magrl.geodesy import wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
-"""Smallest ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 18 to 25 km of travel."""
+"""Smallest ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. (6) divides by: about 18 to 25 km of travel."""
 
 
 def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Tensor:
-    """Return the weights 1 / (B_T - B_0)^2 of Eq. 2-6, with a floor under each difference so that none is infinite.
+    """Return the weights 1 / (B_T - B_0)^2 of Eq. (6), with a floor under each difference so that none is infinite.
 
     Args:
         field: ``(..., E)`` elements where the episode starts.
@@ -42,7 +42,7 @@ def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Te
 
 
 def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
-    """Return the normalized distance to the destination in field space, F of Eq. 2-6.
+    """Return the normalized distance to the destination in field space, F of Eq. (6).
 
     Args:
         field: ``(..., E)`` elements at the vehicle.
@@ -60,7 +60,7 @@ def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
 
 
 def destination_reward(arrived: Tensor, weight: float) -> Tensor:
-    """Return the first term of Eq. 3-3: ``weight`` at arrival, 0 elsewhere.
+    """Return the first term of Eq. (10): ``weight`` at arrival, 0 elsewhere.
 
     Args:
         arrived: ``(...)`` bool.
@@ -79,7 +79,7 @@ def destination_reward(arrived: Tensor, weight: float) -> Tensor:
 def proximity_reward(
     objective_before: Tensor, objective_after: Tensor, weight: float, limit: float | None = None
 ) -> Tensor:
-    """Return the reward of Eq. 3-5: ``weight`` times the decrease of the objective in a step.
+    """Return the reward of Eq. (11): ``weight`` times the decrease of the objective in a step.
 
     F has no upper bound: far from the destination, the reward of one leg exceeds the arrival's many times.
 
@@ -125,7 +125,7 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
 
 
 def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: float = math.pi / 4) -> Tensor:
-    """Return the alignment reward of Eq. 3-6: high where an angle is close to a reference.
+    """Return the alignment reward of Eq. (12): high where an angle is close to a reference.
 
     Args:
         angle: ``(...)`` heading of the leg just made [rad].
@@ -147,7 +147,7 @@ def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: fl
 def parallel_approach(
     field: Tensor, target_field: Tensor, gradient: Tensor, min_crossing: float = math.radians(2.0)
 ) -> tuple[Tensor, Tensor]:
-    """Return the heading at which two elements approach their targets in proportion (Eq. 3-15, unambiguous).
+    """Return the heading at which two elements approach their targets in proportion (Eq. (21), unambiguous).
 
     The paper's arctan of a quotient leaves two opposite headings. The intended one is the direction of
     ``J^-1 (B_T - B)``; with the adjugate instead of the inverse it needs the sign of the determinant but no division.
@@ -167,7 +167,7 @@ def parallel_approach(
         ValueError: for a crossing angle outside [0, pi/2].
 
     Source:
-        Eqs. 3-12 to 3-15, after the bionic navigation of Wang et al. (2018).
+        Eqs. (18) to (21), after the bionic navigation of Wang et al. (2018).
 
     Example:
         >>> gradient = torch.tensor([[0.0, 2.0], [1.0, 0.0]])  # the first element grows eastward, the second northward

@@ -16,7 +16,7 @@ DATE, GENERATION = "2022-01-01", 13
 DISTANCE_KM = (300.0, 500.0)
 """Shortest and longest distance from start to destination [km]."""
 EXAMPLE_START, EXAMPLE_TARGET = (-2.0, 162.0), (-8.0, 164.0)
-"""The trip of Fig. 4-1: latitude, longitude [deg]."""
+"""The trip of Fig. 5: latitude, longitude [deg]."""
 
 TABLE_1 = {
     "num_cells": (512, 512, 512),

@@ -96,7 +96,7 @@ class Results:
 
 
 def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
-    """Return the first episode of a rollout, one row per step with the true field, for Figs. 4-4 and 4-5."""
+    """Return the first episode of a rollout, one row per step with the true field, for Figs. 8 and 9."""
     rollout = with_true_field(rollout)
     count = int(first_episode_mask(rollout["next", "done"]).sum(1)[0])
     states = [rollout[0, 0], *(rollout["next"][0, step] for step in range(count))]
@@ -119,7 +119,7 @@ def with_training_settings(config: Config) -> tuple[Config, list[str]]:
         own = load_scenario(config.scenario, **changes)
         chosen |= {name: own.given(name) for name in ("zeta", "start_heading")}
     settings, notes = training_settings(config.navigators, **chosen)
-    if config.trips == "figure-4-1":  # which lies in the paper's region
+    if config.trips == "paper-example":  # which lies in the paper's region
         settings["scenario"] = config.scenario
     known = {"rules": config.rules.taking(settings), "sheet": config.sheet.taking(settings)}
     return replace(config, **known, **settings), notes
@@ -142,7 +142,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         config, notes = with_training_settings(config)
         changes = config.rules.model_dump(exclude_none=True)
         scenario = choose_trips(config.scenario, config.trips, config.trips_seed, **changes)
-        example = first_trips(scenario, 1) if config.scenario else scenario.with_trips(named_trips("figure-4-1"))
+        example = first_trips(scenario, 1) if config.scenario else scenario.with_trips(named_trips("paper-example"))
         options = {"seed": config.seed, "device": config.device}
         flights = [Flight(trips, config.sheet, **options) for trips in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]

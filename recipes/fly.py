@@ -63,7 +63,7 @@ class Config:
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
-    """Arrival threshold on the objective (Eq. 2-7); by default 0.01, and beyond 400 km less, for a radius of 25 km."""
+    """Arrival threshold on the objective (Eq. (7)); by default 0.01, and beyond 400 km less, for a radius of 25 km."""
     max_steps: int | None = None
     """Maximum number of legs; by default 20 more than three times the shortest path at 50 km a leg."""
     start_heading: float | Literal["random"] = "random"

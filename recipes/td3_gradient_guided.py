@@ -75,7 +75,7 @@ class Config(rule_settings("start_heading"), RegionConfig):
     """Observe target elements minus measured elements."""
 
     alignment_weight: float = 3.0
-    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
+    """Weight zeta_3 of the alignment reward (Eq. (12)) [1/rad]."""
     alignment_offset: float = math.pi / 4
     """Heading deviation at which the alignment reward changes sign [rad]."""
     reward_scale: Positive = 0.05

@@ -23,7 +23,7 @@ DTYPES = (torch.float32, torch.float64)
 FLOORS = torch.tensor(OBJECTIVE_FLOORS, dtype=torch.float64)
 
 
-# --- objective, Eq. 2-6 -----------------------------------------------------------------------------------------------
+# --- objective, Eq. (6) -----------------------------------------------------------------------------------------------
 
 
 def test_weights_and_objective_worked_by_hand():
@@ -49,7 +49,7 @@ def test_small_differences_are_floored():
         torch.testing.assert_close(weights, (counted * FLOORS) ** -2, rtol=1e-9, atol=0)
 
 
-# --- rewards, Eqs. 3-3 to 3-6 -----------------------------------------------------------------------------------------
+# --- rewards, Eqs. (10) to (12) ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -87,7 +87,7 @@ def test_alignment(dtype):
     assert float(alignment_reward(f64(0.0), f64(1.0), 2.0, 0.0)) == -2.0
 
 
-# --- parallel approach, Eq. 3-15 --------------------------------------------------------------------------------------
+# --- parallel approach, Eq. (21) --------------------------------------------------------------------------------------
 
 
 def approaches(count, seed):

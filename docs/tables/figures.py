@@ -4,8 +4,8 @@
     python docs/tables/figures.py conditions --out runs # from new flights; five minutes
 
 From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
-alone), reliability (of stated probabilities). From runs: section-4 (field contours 4-1,
-trajectories 4-4, convergence 4-5, box plots 4-6), and learning (return 4-2, success rate 4-3, with their data).
+alone), reliability (of stated probabilities). From runs: section-4 (Fig. 5, field contours; Fig. 8,
+trajectories; Fig. 9, convergence; Fig. 10, box plots), and learning (Fig. 6, return; Fig. 7, success rate; their data).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ FILE = Path(__file__).parent / "figures.toml"
 Figures = Mapping[str, Figure | DataFrame]
 """Figures by file, from the folder of the documentation, after the data that they are drawn from."""
 CURVES = {
-    "results/fig-4-2-reward": ("eval_return", "return on the validation trips, without alignment"),
-    "results/fig-4-3-success": ("eval_success_rate", "success rate on the validation trips [%]"),
+    "results/fig-6-return": ("eval_return", "return on the validation trips, without alignment"),
+    "results/fig-7-success": ("eval_success_rate", "success rate on the validation trips [%]"),
 }
 """Column and label of learning curves."""
 DATA = dict.fromkeys(CURVES, "results/learning.csv")
-DATA |= dict.fromkeys(("figures/fig-4-4-trajectories", "results/fig-4-5-convergence"), "results/comparison.md")
-DATA |= {"results/fig-4-6-boxes": "results/comparison.md", "figures/conditions": "results/conditions.csv"}
+DATA |= dict.fromkeys(("figures/fig-8-trajectories", "results/fig-9-convergence"), "results/comparison.md")
+DATA |= {"results/fig-10-boxes": "results/comparison.md", "figures/conditions": "results/conditions.csv"}
 DATA |= {f"figures/{name}": f"results/{name}.csv" for name in ("reliability", "place-error")}
 """Data of figures: the table is of the same evaluation."""
 SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
@@ -76,15 +76,15 @@ def columns_by_navigator(path: Path) -> dict[str, dict[str, list[float]]]:
 def section_4() -> Figures:
     """Return the field over the region, the example trip of each navigator, and box plots."""
     contours = Figure(figsize=(7, 7.4), layout="constrained")
-    field, trip = Scenario().build_field(), named_trips("figure-4-1")
+    field, trip = Scenario().build_field(), named_trips("paper-example")
     draw_tracks(contours.subplots(), field, PAPER_REGION, [trip.start], trip.target)
     paths, episodes = (columns_by_navigator(RUNS / "comparison" / f"{name}.csv") for name in ("paths", "episodes"))
     tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
     return {
-        "figures/fig-4-1-contours": contours,
-        "figures/fig-4-4-trajectories": plots.compared_trajectories(tracks, field, trip),
-        "results/fig-4-5-convergence": plots.convergence(paths, field, trip),
-        "results/fig-4-6-boxes": plots.box_plots(episodes),
+        "figures/fig-5-contours": contours,
+        "figures/fig-8-trajectories": plots.compared_trajectories(tracks, field, trip),
+        "results/fig-9-convergence": plots.convergence(paths, field, trip),
+        "results/fig-10-boxes": plots.box_plots(episodes),
     }
 
 

@@ -81,7 +81,7 @@ def learning_curves(
 def compared_trajectories(
     tracks: Mapping[str, tuple[Sequence[float], Sequence[float]]], field: FieldModel, trip: Trips
 ) -> Figure:
-    """Return a map of the paths of several navigators on one trip, over the field's contours (Fig. 4-4).
+    """Return a map of the paths of several navigators on one trip, over the field's contours (Fig. 8).
 
     Args:
         tracks: by navigator, latitudes and longitudes of its waypoints [deg].
@@ -92,7 +92,7 @@ def compared_trajectories(
         >>> from magrl.field.igrf import IGRF
         >>> from magrl.envs.trips import named_trips
         >>> track = ([-2.0, -8.0], [162.0, 164.0])
-        >>> figure = compared_trajectories({"secant": track}, IGRF("2022-01-01"), named_trips("figure-4-1"))
+        >>> figure = compared_trajectories({"secant": track}, IGRF("2022-01-01"), named_trips("paper-example"))
         >>> figure.axes[0].lines[-1].get_label()
         'destination'
     """
@@ -111,7 +111,7 @@ def compared_trajectories(
 
 
 def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: FieldModel, trip: Trips) -> Figure:
-    """Return D, I, B_H and the length of legs against the step (Fig. 4-5 a to d).
+    """Return D, I, B_H and the length of legs against the step (Fig. 9 a to d).
 
     Args:
         series: by navigator, values of ``D``, ``I``, ``B_H`` and ``L`` at each step, the start first.
@@ -122,7 +122,7 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
         >>> from magrl.field.igrf import IGRF
         >>> from magrl.envs.trips import named_trips
         >>> values = {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0], "L": [0.0, 50.0]}
-        >>> figure = convergence({"secant": values}, IGRF("2022-01-01"), named_trips("figure-4-1"))
+        >>> figure = convergence({"secant": values}, IGRF("2022-01-01"), named_trips("paper-example"))
         >>> [axes.get_title() for axes in figure.axes]
         ['(a)', '(b)', '(c)', '(d)']
     """
@@ -142,7 +142,7 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
 
 
 def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Return box plots of heading deviation, smoothness and navigation error of successes (Fig. 4-6 a to d).
+    """Return box plots of heading deviation, smoothness and navigation error of successes (Fig. 10 a to d).
 
     Args:
         measures: by navigator, one value for each episode of ``heading_mae_deg``, ``heading_rmse_deg``,

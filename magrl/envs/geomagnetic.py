@@ -39,7 +39,7 @@ class GeomagneticNavEnv(EnvBase):
     """Vehicles that cross a region to a destination of which they know only the magnetic elements.
 
     Each vehicle measures D, I, B_H; it knows those of its destination, its heading from true north and its last leg.
-    It chooses how far to turn and then how far to go. It has arrived when the objective F (Eq. 2-6) is below ``zeta``.
+    It chooses how far to turn and then how far to go. It has arrived when the objective F (Eq. (6)) is below ``zeta``.
     A vehicle that leaves the region by more than the scenario's margin is lost: the episode ends as a failure. Where
     the scenario has several regions, each episode draws its own.
 

@@ -105,7 +105,7 @@ def region_scenario(
         **options: further fields of :class:`Scenario`, such as ``distance_range_km`` and ``distance_law``.
 
     Returns:
-        The scenario, with floors of Eq. 2-6 from the field of each region.
+        The scenario, with floors of Eq. (6) from the field of each region.
 
     Raises:
         ValueError: for a number out of its range, conditions for which no place was found, an expansion that misses the

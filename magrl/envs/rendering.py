@@ -86,7 +86,7 @@ def contour_lines(axes: Axes, field: FieldModel, region: Region | Regions) -> di
 
 
 def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
-    """Draw labeled contours of D, I and B_H over a region (Fig. 4-1).
+    """Draw labeled contours of D, I and B_H over a region (Fig. 5).
 
     Args:
         axes: axes to draw on.

@@ -33,7 +33,7 @@ from magrl.files import read_document
 from magrl.pilot.records import EpisodeRules
 
 FLOOR_KM = 25.0
-"""Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
+"""Distance of travel whose mean change of each element is the default floor of Eq. (6) away from the paper's box."""
 
 
 def numbers_validator(name: str, count: int) -> BeforeValidator:
@@ -143,7 +143,7 @@ class Scenario(EpisodeRules):
     objective_floors: Annotated[tuple[float, float, float] | None, numbers_validator("objective_floors", 3)] = (
         guidance.OBJECTIVE_FLOORS
     )
-    """Least differences of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by, or None for the mean change of each over
+    """Least differences of D [deg], I [deg], B_H [nT] that Eq. (6) divides by, or None for the mean change of each over
     :data:`FLOOR_KM` in the region. Where the field is steep, floors that are too low make every detour very costly."""
     field: Annotated[Any, BeforeValidator(_field)] = None
     """Field model (:class:`magrl.field.FieldModel`) instead of IGRF; over many regions a
@@ -242,7 +242,7 @@ class Scenario(EpisodeRules):
         return copy.deepcopy(field, {id(values): values for values in field.buffers()})  # a copy may be moved
 
     def floors(self, field: FieldModel | FieldBank) -> Tensor:
-        """Return the floors of Eq. 2-6, D [deg], I [deg], B_H [nT], from ``field`` where none are given.
+        """Return the floors of Eq. (6), D [deg], I [deg], B_H [nT], from ``field`` where none are given.
 
         Returns:
             ``(K, 3)`` float64, for each region.

@@ -271,8 +271,8 @@ def check_trips(trips: Trips, within: Regions) -> Trips:
     return Trips(start, target, region)
 
 
-TRIP_SETS = ("test-1000", "paper-100", "figure-4-1")
-"""Frozen trip sets: 1000 unseen trips, the paper's 100, and its one trip of Fig. 4-1."""
+TRIP_SETS = ("test-1000", "paper-100", "paper-example")
+"""Frozen trip sets: 1000 unseen trips, the paper's 100, and its one trip of Fig. 5."""
 
 RANDOM_SETS = {"test-1000": (1000, TEST_SEED), "paper-100": (100, PAPER_SEED)}
 """Number of trips and seed of each random set."""
@@ -288,7 +288,7 @@ def named_trips(name: str) -> Trips:
         ValueError: for another name.
 
     Example:
-        >>> named_trips("figure-4-1").start
+        >>> named_trips("paper-example").start
         tensor([[ -2., 162.]], dtype=torch.float64)
     """
     check_choice(TRIP_SETS, trips=name)

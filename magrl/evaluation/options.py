@@ -11,7 +11,7 @@ from magrl.envs.scenario import RULES, rule_settings
 from magrl.envs.trips import RANDOM_SETS
 from magrl.random_numbers import FIRST_RESERVED_SEED
 
-TripSet = Literal["test-1000", "paper-100", "figure-4-1"]
+TripSet = Literal["test-1000", "paper-100", "paper-example"]
 FIRST_TRIPS_SEED = 2 * FIRST_RESERVED_SEED
 """Seed of random trips with --trips-seed 0: beyond the seeds of trainings and of frozen sets."""
 
@@ -48,8 +48,8 @@ def choose_trips(path: Path | None, trips: str | int | None, trips_seed: int | N
         raise ValueError(f"--trips-seed {trips_seed} needs a number of random trips, such as --trips 300")
     if path is None:
         return scenario.with_trips(named_trips(trips or "test-1000"))
-    if trips == "figure-4-1":
-        raise ValueError("--trips figure-4-1 lies in the paper's region: omit it, or --scenario")
+    if trips == "paper-example":
+        raise ValueError("--trips paper-example lies in the paper's region: omit it, or --scenario")
     if scenario.trips is not None and trips is None:
         return scenario
     return scenario.with_trips(scenario.random_trips(*RANDOM_SETS[trips or "test-1000"]))

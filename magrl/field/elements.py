@@ -1,4 +1,4 @@
-"""Magnetic elements: a field vector as angles and intensities (Eq. 2-1, with signs).
+"""Magnetic elements: a field vector as angles and intensities (Eq. (1), with signs).
 
 The paper's arccos loses the sign of both angles; ``atan2`` keeps it. Declination and inclination are in degrees,
 intensities in nanotesla. The order of the three elements that a vehicle measures is D, I, B_H everywhere. A NaN

@@ -214,7 +214,7 @@ class Metaheuristic(Navigator):
         return distance.squeeze(-1) * self.max_leg_km, turn.squeeze(-1)
 
     def _objective_at(self, seen: TensorDictBase, distance: Tensor, turn: Tensor) -> Tensor:
-        """Return F (Eq. 2-6) at the ends of legs ``(N, K)``; infinite beyond the field model."""
+        """Return F (Eq. (6)) at the ends of legs ``(N, K)``; infinite beyond the field model."""
         start = seen["position"].unsqueeze(1)
         heading = seen["heading"].double() + turn
         end = torch.stack(move(start[..., 0], start[..., 1], heading, distance * self.max_leg_km), -1)

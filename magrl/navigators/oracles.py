@@ -53,7 +53,7 @@ class ParallelApproach(Navigator):
     """Newton steps with the true gradient at the vehicle's position: an oracle.
 
     Each step closes the errors of all three elements by least squares, weighted by the inverse of
-    :data:`magrl.navigators.quasi_newton.CURVATURE`. The paper's parallel approach (Eq. 3-15) closes those of two, and
+    :data:`magrl.navigators.quasi_newton.CURVATURE`. The paper's parallel approach (Eq. (21)) closes those of two, and
     fails where their gradients are nearly parallel.
 
     Args:

@@ -48,7 +48,7 @@ def track_observation(
         covariance: ``(..., 2, 2)`` of the estimated displacement to the destination [km^2].
         gradient: ``(..., E, 2)`` estimated, forward and to the right [element unit / km].
         remaining: ``(..., E)`` target elements minus estimated ones.
-        weights: ``(..., E)`` of the objective F (Eq. 2-6), divided by the arrival threshold.
+        weights: ``(..., E)`` of the objective F (Eq. (6)), divided by the arrival threshold.
         std: ``(..., E)`` standard deviation of the noise of D [deg], I [deg], B_H [nT].
         time: ``(..., 1)`` share of the step limit that is over.
         price: ``(..., 1)`` price of a step [% of SPL].

@@ -46,7 +46,7 @@ class EpisodeRules(CheckedModel):
     max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
     """Largest turn to either side before a leg [deg]."""
     zeta: Annotated[float, Field(gt=0, lt=3)] = 0.01
-    """Arrival threshold on the objective F (Eq. 2-7), below 3, its largest value at the start."""
+    """Arrival threshold on the objective F (Eq. (7)), below 3, its largest value at the start."""
     arrival: Literal["objective", "distance", "declared"] = "objective"
     """Rule of arrival: F below zeta (objective); a distance below radius_km (distance); or a third number of the
     action, in [-1, 1], by which the vehicle declares above 0 that it has arrived (declared): that ends the episode,

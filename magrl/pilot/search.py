@@ -98,7 +98,7 @@ def visit(visited: Tensor, leg: Tensor) -> Tensor:
 
 
 def arrival_weights(field: Tensor, target_field: Tensor, zeta: float) -> Tensor:
-    """Return the weights of the objective F (Eq. 2-6) over its threshold: their sum of squares is 1 at arrival.
+    """Return the weights of the objective F (Eq. (6)) over its threshold: their sum of squares is 1 at arrival.
 
     They have the paper's floors (:data:`magrl.guidance.OBJECTIVE_FLOORS`) in every region: a vehicle without a map does
     not know what the field of its region changes on the mean, from which the environment has its floors.

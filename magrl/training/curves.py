@@ -44,7 +44,7 @@ class TrainingStatistics:
     """Counts of a training, and means over its last episodes.
 
     Args:
-        window: number of episodes in ``return``, its terms and ``success_rate``, as in Figs. 4-2 and 4-3.
+        window: number of episodes in ``return``, its terms and ``success_rate``, as in Figs. 6 and 7.
 
     Attributes:
         frames, episodes, iterations, updates: counts since the start of the training.

@@ -113,7 +113,7 @@ class TD3Loss(TorchRLTD3Loss):
         return [weight for critic in self.networks.critics for weight in critic.parameters()]
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of both critics (Eqs. 3-9 to 3-11).
+        """Return the loss of both critics (Eqs. (15) to (17)).
 
         Args:
             tensordict: ``(B,)`` transitions: observations, ``action``, and in ``next`` observations, ``reward`` and
@@ -139,7 +139,7 @@ class TD3Loss(TorchRLTD3Loss):
         return loss, {"target_value": target_value}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of the actor: minus the value that the first critic gives to its actions (Eq. 3-13).
+        """Return the loss of the actor: minus the value that the first critic gives to its actions (Algorithm 1).
 
         Args:
             tensordict: ``(B,)`` transitions.

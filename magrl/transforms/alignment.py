@@ -105,7 +105,7 @@ def _pair_indices(pair: object) -> list[int]:
 
 
 class GradientHeading(ObservationTransform):
-    """Write the theoretical heading of the parallel approach (Eq. 3-15), on any pair of elements.
+    """Write the theoretical heading of the parallel approach (Eq. (21)), on any pair of elements.
 
     The paper's pair (D, I) crosses well in its region. Elsewhere the gradients of a fixed pair may be parallel;
     ``pair="auto"`` takes at each place the pair that crosses best, so that the heading is defined wherever one is.
@@ -174,7 +174,7 @@ class GradientHeading(ObservationTransform):
 
 
 class AlignmentReward(StepReward):
-    """Add the alignment term of Eq. 3-6 to the reward: high where an angle is close to a reference.
+    """Add the alignment term of Eq. (12) to the reward: high where an angle is close to a reference.
 
     The reference is read before the leg, the angle (the heading of the leg just made) after it. In a replay buffer or
     as a module, the angle and the reward are those under ``"next"``.

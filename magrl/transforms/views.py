@@ -140,7 +140,7 @@ class ObservationView(_View):
     """Keys that an agent observes, and their scaling; see :meth:`magrl.envs.GeomagneticNavEnv.observation_view`.
 
     Args:
-        observe_heading: whether cosine and sine of the heading are observed. Without them the state is Eq. 3-1,
+        observe_heading: whether cosine and sine of the heading are observed. Without them the state is Eq. (8),
             from which a policy without memory cannot tell the direction of its next leg.
         observe_difference: whether target elements minus measured elements are observed.
         observe_areas: whether no-go areas in sight are observed (:class:`~magrl.transforms.NoGoAreas`).

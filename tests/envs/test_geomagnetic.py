@@ -156,9 +156,9 @@ def test_one_leg_by_hand() -> None:
 
     origin, here, there = (elements_by_ppigrf(*place) for place in (START, end, TARGET))
     assert after["field"].tolist() == pytest.approx(here.tolist(), rel=1e-6, abs=1e-5)
-    objective = float((((there - here) / (there - origin)) ** 2).sum())  # Eq. 2-6
+    objective = float((((there - here) / (there - origin)) ** 2).sum())  # Eq. (6)
     assert after["objective"].item() == pytest.approx(objective, rel=1e-5)
-    assert after["reward"].item() == pytest.approx(10 * (3 - objective), rel=1e-3)  # Eq. 3-5
+    assert after["reward"].item() == pytest.approx(10 * (3 - objective), rel=1e-3)  # Eq. (11)
     assert not after["done"]
 
 

@@ -119,7 +119,7 @@ def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
     stated = []
     for longest, own in ((300.0, {}), (500.0, {}), (1800.0, {}), (1800.0, {"trip_km": 500.0})):
         ship = Conditions("ship", SHIP, {"weather": {"record": "quiet", "span_h": 200.0, **own}})
-        scenario = Scenario(distance_range_km=(100.0, longest), trips=named_trips("figure-4-1"))
+        scenario = Scenario(distance_range_km=(100.0, longest), trips=named_trips("paper-example"))
         stated.append(Flight(scenario, errors=ship).sensor_std.drift[2])
     assert stated == pytest.approx([12, 12, 32, 12], abs=0.5)
 

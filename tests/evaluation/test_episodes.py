@@ -43,7 +43,7 @@ from magrl.navigators import FieldPolicy, PolicyConfig, Secant, policy_env
 
 def test_every_trip_is_flown_once_with_errors_of_its_own() -> None:
     """The same trip has other noise and another start heading for each vehicle; the same call has the same."""
-    trips = named_trips("figure-4-1")
+    trips = named_trips("paper-example")
     thrice = Scenario().with_trips(Trips(trips.start.repeat(3, 1), trips.target.repeat(3, 1)))
     for options in ({"errors": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
         one, again = (evaluate("secant", thrice, max_steps=5, **options)["smoothness_deg"] for _ in range(2))
@@ -81,7 +81,7 @@ def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
     assert env.rollout(4, policy)["action"].unique().numel() > 4
     actions = evaluation_rollout(env, policy)["action"]
     assert torch.equal(actions, torch.tensor([25.0, 0.0]).expand_as(actions))
-    episodes = [evaluate(policy, "figure-4-1", max_steps=4)["length_km"] for _ in range(2)]
+    episodes = [evaluate(policy, "paper-example", max_steps=4)["length_km"] for _ in range(2)]
     assert torch.equal(*episodes)
 
 
@@ -91,10 +91,10 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     elsewhere = elsewhere.with_trips(elsewhere.random_trips(2, seed=0))
     for policy, trips, options, message in (
         ("secant", Scenario(), {}, "the scenario has no trips to fly"),
-        ("secant", "figure-4-1", {"errors": "yacht"}, "conditions must be one of 'laboratory'"),
+        ("secant", "paper-example", {"errors": "yacht"}, "conditions must be one of 'laboratory'"),
         (agent, elsewhere, {}, "trained"),
-        (agent, "figure-4-1", {"max_turn_deg": 20}, "up to 90°, the environment .* and 20°"),
-        (5, "figure-4-1", {}, "policy must be callable"),
+        (agent, "paper-example", {"max_turn_deg": 20}, "up to 90°, the environment .* and 20°"),
+        (5, "paper-example", {}, "policy must be callable"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             evaluate(policy, trips, **options)

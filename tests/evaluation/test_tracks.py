@@ -30,7 +30,7 @@ TRACK_DIGESTS = {
     "north-v1": ("e35c4d00c50322a3", "bcb45c2e6536f22e"),
 }
 """Of the declaration and trips, and of readings."""
-SETS = {"test-1000": "a86aacd1afedb688", "paper-100": "82cb3cd8bee75af2", "figure-4-1": "a7aac085136a6d62"}
+SETS = {"test-1000": "a86aacd1afedb688", "paper-100": "82cb3cd8bee75af2", "paper-example": "a7aac085136a6d62"}
 ANSWERS = {
     "magrl/GeomagneticNavigation-v0": ("c8777cf8c2c491ef", -9.9493),
     "magrl/GeomagneticNavigationAnywhere-v1": ("7902808c1ad4c6cb", 72.2815),

@@ -1,4 +1,4 @@
-"""The magnetic elements of Eq. 2-1: signs, limits, inverse and Jacobian."""
+"""The magnetic elements of Eq. (1): signs, limits, inverse and Jacobian."""
 
 import math
 

@@ -32,7 +32,7 @@ from magrl import envs, errors, field, navigators, transforms
 assert not {"matplotlib", "pandas", "wandb", "tqdm", "tyro"} & (set(sys.modules) - theirs), "imports are not light"
 import gymnasium
 
-assert magrl.evaluate("anywhere", "figure-4-1")["success"].all()
+assert magrl.evaluate("anywhere", "paper-example")["success"].all()
 assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape == (13,)
 
 from magrl.evaluation import maps
@@ -115,7 +115,7 @@ def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
 def test_user_s_code_is_typed(python: Path, tmp_path: Path) -> None:
     """Under mypy --strict: a script that is right passes, one that is wrong does not, and no public name is Any."""
     (tmp_path / "mypy.ini").write_text(MYPY.format(cache=tmp_path / "cache"), encoding="utf-8")
-    right = "import magrl\nrate: float = magrl.summarize(magrl.evaluate('secant', 'figure-4-1'))['success_rate']\n"
+    right = "import magrl\nrate: float = magrl.summarize(magrl.evaluate('secant', 'paper-example'))['success_rate']\n"
     right += "".join(f"reveal_type(magrl.{name})\n" for name in magrl.__all__)
     (tmp_path / "user.py").write_text(right, encoding="utf-8")
     check = (sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "--python-executable", python)

@@ -73,7 +73,7 @@ def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
 def test_paths_and_settings_state_what_was_flown(results: Path) -> None:
     """The paper's example with the true field; a run is flown as it was trained."""
     starts = [r for r in rows(results / "paths.csv") if r["step"] == "0"]
-    state = GeomagneticNavEnv(Scenario().with_trips(named_trips("figure-4-1")), seed=0).reset()
+    state = GeomagneticNavEnv(Scenario().with_trips(named_trips("paper-example")), seed=0).reset()
     assert len(starts) == 3
     for row in starts:
         assert (float(row["latitude"]), float(row["longitude"])) == (-2.0, 162.0)
@@ -120,8 +120,8 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     assert "paper" not in text
     assert "Arrival: distance, within 25 km." in text
     for message, change in (
-        (r"run: .*trained where D is", {"trips": "figure-4-1", "scenario": None}),
-        ("--trips figure-4-1 lies in the paper's region", {"trips": "figure-4-1"}),
+        (r"run: .*trained where D is", {"trips": "paper-example", "scenario": None}),
+        ("--trips paper-example lies in the paper's region", {"trips": "paper-example"}),
     ):
         with pytest.raises(UsageError, match=message):
             evaluate.evaluate(evaluate.Config(names[:1], **(config | change | {"out": tmp_path / "other"})))
@@ -139,7 +139,7 @@ def test_bad_usage_is_refused_before_anything_is_flown(tmp_path, monkeypatch) ->
         (("secant",), {"device": "tpu"}, "device 'tpu' cannot be used here .*: choose another, such as cpu"),
         (("secant",), {"scenario": Path("missing.toml")}, "no scenario file at"),
     ):
-        given = {"trips": None if "scenario" in options else "figure-4-1", "out": tmp_path / "out"} | options
+        given = {"trips": None if "scenario" in options else "paper-example", "out": tmp_path / "out"} | options
         with pytest.raises(UsageError, match=message):
             evaluate.evaluate(evaluate.Config(navigators, **given))
     assert not (tmp_path / "out").exists()

@@ -254,7 +254,7 @@ def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) ->
         assert [line.get_xydata()[0].tolist() for line in means] == [[10240, first]] * 2
         assert [line.get_ydata()[-1] for line in means] == last
     figures.draw(("learning",), out=tmp_path)
-    with Image.open(tmp_path / "results" / "fig-4-2-reward.png") as picture:
+    with Image.open(tmp_path / "results" / "fig-6-return.png") as picture:
         assert picture.info["Description"] == flights.digest(tmp_path / "results" / "learning.csv")
 
 
@@ -267,4 +267,4 @@ def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeyp
     assert len(table.episodes[0]) == 6
     assert [row[0] for row in rows(table.text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]
     made = figures.section_4()
-    assert [label.get_text() for label in made["results/fig-4-6-boxes"].axes[0].get_xticklabels()] == navigators
+    assert [label.get_text() for label in made["results/fig-10-boxes"].axes[0].get_xticklabels()] == navigators

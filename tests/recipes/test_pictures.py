@@ -15,7 +15,7 @@ from magrl.transforms.areas import NUMBER
 
 DOCS = ROOT / "docs"
 DRAWN = figures.DATA | {"results/scores": "results/scores.csv"}
-OTHERS = {"fig-4-1-contours", "two-elements"}  # of the field alone
+OTHERS = {"fig-5-contours", "two-elements"}  # of the field alone
 OTHERS |= {"eddies", *(f"task-{task}" for task in pictures.NAMED_TASKS)}  # flights
 OTHERS |= {"plume", "cost-by-vehicles"}  # a training, a benchmark
 

@@ -21,7 +21,7 @@ def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
 
 def test_figures_of_the_example_trip() -> None:
     """The destination is a dashed line in each element; steps are counted from the first."""
-    trip, values = named_trips("figure-4-1"), {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0]}
+    trip, values = named_trips("paper-example"), {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0]}
     panels = plots.convergence({"secant": values | {"L": [0.0, 50.0]}}, IGRF("2022-01-01"), trip).axes
     assert [len(axes.lines) for axes in panels] == [2, 2, 2, 1]
     assert panels[3].lines[0].get_xydata().tolist() == [[1, 50]]

@@ -130,7 +130,7 @@ def test_training_in_eddies(tmp_path: Path, monkeypatch) -> None:
     flown = policy_env(plain, policy).rollout(5, policy, break_when_any_done=False)
     trained = own.rollout(5, policy.actor, break_when_any_done=False)
     assert torch.equal(flown["next", "recent_legs"], trained["next", "observation"])
-    assert len(evaluate(policy, "figure-4-1", max_steps=2)) == 1
+    assert len(evaluate(policy, "paper-example", max_steps=2)) == 1
     with pytest.raises(ValueError, match="a map is of one region, got 3"):
         evaluate(policy, planet_scenario(3, seed=0).with_trips(planet_scenario(3, seed=0).random_trips(2, seed=0)))
 
