@@ -65,9 +65,9 @@ ONE := OMP_NUM_THREADS=1 $(RUN)/python
 FIVE := 0 1 2 3 4
 AGENTS := $(foreach run,td3_gradient_guided-fast td3_gradient_guided-fast-no-cost td3-fast td3-fast-cost,$(FIVE:%=$(run)-seed%))
 RUNS_table-comparison := $(AGENTS)
-RUNS_figure-learning := $(AGENTS)
 RUNS_table-noise := $(foreach run,td3_gradient_guided-fast td3_gradient_guided-fast-noise,$(FIVE:%=$(run)-seed%))
 RUNS_table-paper-run := td3_gradient_guided-paper-seed0 td3-paper-seed0
+RUNS_figure-learning := $(RUNS_table-paper-run)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' docs/tables/tables.toml)
 FIGURES ?= place-error section-4 learning conditions two-elements reliability
 
@@ -76,7 +76,7 @@ tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TAB
 	@for table in docs/results/*.md; do made=$$(git log -1 --format=%h -- $$table); \
 	  echo "$$table is of $$made, $$(git rev-list --count $$made.. -- magrl recipes docs/tables) commits of the code ago"; done
 
-figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="place-error"; section-4 after table comparison
+figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="place-error"; section-4 after table paper-run
 
 .SECONDARY:  # keep the runs
 .SECONDEXPANSION:

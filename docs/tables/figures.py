@@ -1,6 +1,6 @@
 """Draw the figures of the documentation.
 
-    python docs/tables/figures.py section-4 learning    # from runs of evaluations and trainings
+    python docs/tables/figures.py section-4 learning    # from table paper-run and its trainings
     python docs/tables/figures.py conditions --out runs # from new flights; five minutes
 
 From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
@@ -44,8 +44,8 @@ FILE = Path(__file__).parent / "figures.toml"
 Figures = Mapping[str, Figure | DataFrame]
 """Figures by file, from the folder of the documentation, after the data that they are drawn from."""
 CURVES = {
-    "results/fig-6-return": ("eval_return", "return on the validation trips, without alignment"),
-    "results/fig-7-success": ("eval_success_rate", "success rate on the validation trips [%]"),
+    "results/fig-6-return": ("return", "return, mean of the last 200 episodes"),
+    "results/fig-7-success": ("success_rate", "success rate of the last 200 episodes [%]"),
 }
 """Column and label of learning curves."""
 DATA = dict.fromkeys(CURVES, "results/learning.csv")
@@ -53,8 +53,6 @@ DATA |= dict.fromkeys(("figures/fig-8-trajectories", "results/fig-9-convergence"
 DATA |= {"results/fig-10-boxes": "results/comparison.md", "figures/conditions": "results/conditions.csv"}
 DATA |= {f"figures/{name}": f"results/{name}.csv" for name in ("reliability", "place-error")}
 """Data of figures: the table is of the same evaluation."""
-SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
-"""Navigators in the figures of Section 4."""
 MARKERS = {"anywhere": "o", "kalman": "s", "secant": "v", "parallel": "x"}
 """Navigators in panels, and their markers."""
 
@@ -63,11 +61,11 @@ MARKERS = {"anywhere": "o", "kalman": "s", "secant": "v", "parallel": "x"}
 
 
 def columns_by_navigator(path: Path) -> dict[str, dict[str, list[float]]]:
-    """Return the columns of a file of recipes/evaluate.py for each navigator of :data:`SHOWN`, without failures."""
+    """Return the columns of a file of recipes/evaluate.py for each navigator, without failures."""
     columns: dict[str, dict[str, list[float]]] = {}
     for row in csv.DictReader(read_text(path).splitlines()):
         name = row.pop("navigator")
-        if name in SHOWN and row.pop("success", "True") == "True":
+        if row.pop("success", "True") == "True":
             for key, value in row.items():
                 columns.setdefault(name, {}).setdefault(key, []).append(float(value or "nan"))
     return columns
@@ -78,7 +76,7 @@ def section_4() -> Figures:
     contours = Figure(figsize=(7, 7.4), layout="constrained")
     field, trip = Scenario().build_field(), named_trips("paper-example")
     draw_tracks(contours.subplots(), field, PAPER_REGION, [trip.start], trip.target)
-    paths, episodes = (columns_by_navigator(RUNS / "comparison" / f"{name}.csv") for name in ("paths", "episodes"))
+    paths, episodes = (columns_by_navigator(RUNS / "paper-run" / f"{name}.csv") for name in ("paths", "episodes"))
     tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
     return {
         "figures/fig-5-contours": contours,
@@ -89,26 +87,18 @@ def section_4() -> Figures:
 
 
 def learning() -> Figures:
-    """Return the learning curves of the runs in figures.toml, and their data.
+    """Return the learning curves of the runs in figures.toml, as the paper draws them, and their data.
 
-    Both are of the validation trips, without exploration, and the return is of the terms that all agents share. Of
-    training episodes, those of all vehicles that fail end together, every 50 steps.
+    They are of training episodes, with exploration; the return of a guided agent has the alignment term.
     """
     runs = [
         read_csv(Path(run) / "train.csv").assign(navigator=name, run=number)
         for name, pattern in declared(FILE)["learning"].items()
         for number, run in enumerate(matching(pattern))
     ]
-    data = concat(runs)[["navigator", "run", "frames", "eval_return", "eval_success_rate"]].dropna().round(2)
-    return {"results/learning": data} | {file: curves(data, *shown) for file, shown in CURVES.items()}
-
-
-def curves(data: DataFrame, column: str, label: str) -> Figure:
-    """Return the curves of a column."""
-    names = data["navigator"].unique()
-    runs = {name: [run for _, run in data[data["navigator"] == name].groupby("run")] for name in names}
-    values = {name: [(run["frames"], run[column]) for run in found] for name, found in runs.items()}
-    return plots.learning_curves(values, label)
+    data = concat(runs)[["navigator", "run", "episodes", "return", "success_rate"]].dropna().round(2)
+    data = data[data["episodes"] % 50 == 0].drop_duplicates(["navigator", "run", "episodes"])
+    return {"results/learning": data} | {file: plots.learning_curves(data, *shown) for file, shown in CURVES.items()}
 
 
 # From new flights

@@ -18,19 +18,16 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from pandas import DataFrame
 
 NAVIGATOR_COLORS = {"gg_td3": "#0072B2", "anywhere": "#0072B2", "td3": "#D55E00", "kalman": "#D55E00"}
 NAVIGATOR_COLORS |= {"secant": "#009E73", "parallel": "#000000", "ga": "#E69F00", "pso": "#56B4E9", "afsa": "#CC79A7"}
 """Color of each navigator in every figure, of Okabe and Ito (2008); no figure has two navigators of one color."""
-_LABELED = ("#CC79A7", "#E69F00", "#56B4E9", "#999999")
-"""Colors of agents that have a label of their own, by their number in a figure."""
 
 
-def _look(name: str, index: int = 0) -> dict[str, Any]:
-    """Return color and label of a navigator, given its name or a label; a label has a color by its index."""
-    color = NAVIGATOR_COLORS.get(name, _LABELED[index % len(_LABELED)])
-    return {"color": color, "label": KINDS[name].label if name in KINDS else name}
+def _look(name: str) -> dict[str, Any]:
+    """Return color and label of a navigator."""
+    return {"color": NAVIGATOR_COLORS[name], "label": KINDS[name].label}
 
 
 def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
@@ -43,36 +40,29 @@ def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
     return figure, panels
 
 
-def learning_curves(
-    curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]], label: str, points: int = 200
-) -> Figure:
+def learning_curves(data: DataFrame, column: str, label: str) -> Figure:
     """Return learning curves of several trainings of each navigator: single runs, their mean and their range.
 
     Args:
-        curves: by navigator, for each run its frames and its values; NaN is left out.
+        data: a row for each ``navigator``, ``run`` and number of ``episodes``.
+        column: name of the values.
         label: label of the vertical axis.
-        points: number of points of the mean.
 
     Example:
-        >>> figure = learning_curves({"td3": [([0, 100], [0.0, 50.0]), ([0, 100], [10.0, 70.0])]}, "SPL [%]")
-        >>> figure.axes[0].get_legend().get_texts()[0].get_text()
+        >>> data = DataFrame({"navigator": "td3", "run": [0, 1], "episodes": 50, "spl": [50.0, 70.0]})
+        >>> learning_curves(data, "spl", "SPL [%]").axes[0].get_legend().get_texts()[0].get_text()
         'TD3, 2 seeds'
     """
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
-    for index, (name, runs) in enumerate(curves.items()):
-        look, measured = _look(name, index), [np.array(run)[:, np.isfinite(run[1])] for run in runs]
-        measured = [run for run in measured if run.shape[1]]
-        if not measured:
-            continue
-        grid = np.linspace(max(run[0, 0] for run in measured), min(run[0, -1] for run in measured), points)
-        values = np.array([np.interp(grid, *run) for run in measured])
-        axes.plot(grid, values.T, color=look["color"], lw=0.5, alpha=0.5)
-        axes.fill_between(grid, values.min(0), values.max(0), color=look["color"], alpha=0.15, lw=0)
-        text = f"{look['label']}, {len(measured)} seed{'s' if len(measured) > 1 else ''}"
-        axes.plot(grid, values.mean(0), color=look["color"], lw=2, label=text)
-    axes.set(xlabel="frames (vehicle-steps)", ylabel=label)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for name, rows in data.groupby("navigator", sort=False):
+        look = _look(str(name))
+        runs = rows.pivot_table(column, "episodes", "run").dropna()
+        axes.plot(runs, color=look["color"], lw=0.5, alpha=0.5)
+        axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=look["color"], alpha=0.15, lw=0)
+        text = f"{look['label']}, {runs.shape[1]} seed{'s' if runs.shape[1] > 1 else ''}"
+        axes.plot(runs.mean(axis=1), color=look["color"], lw=2, label=text)
+    axes.set(xlabel="episodes", ylabel=label)
     axes.grid(alpha=0.3)
     axes.legend()
     return figure

@@ -240,18 +240,20 @@ def test_the_reliability_diagram_has_a_panel_for_noise_and_one_for_vehicles(monk
 
 
 def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) -> None:
-    """Both are of the validation trips."""
+    """They are of training episodes, at the first row of each 50th."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figures, "declared", lambda _: {"learning": {"gg_td3": "runs/guided*", "td3": "runs/plain*"}})
     for run, last in (("guided", 90), ("plain-seed0", 80), ("plain-seed1", 60)):
         (tmp_path / "runs" / run).mkdir(parents=True)
-        rows = ["frames,return,eval_return,eval_success_rate", "10240,200,9,40", f"60000,100,{last + 100},{last}"]
+        rows = ["episodes,return,eval_return,success_rate", "0,nan,,nan", "50,9,1,40", "50,8,,30", "77,7,,20"]
+        rows += [f"100,{last + 100},2,{last}"]
         (tmp_path / "runs" / run / "train.csv").write_text("\n".join(rows), encoding="utf-8")
     data, reward, success = figures.learning().values()
+    assert len(data) == 6
     assert data.groupby("navigator")["run"].nunique().to_dict() == {"gg_td3": 1, "td3": 2}
     for figure, first, last in ((reward, 9, [190, 170]), (success, 40, [90, 70])):
         means = [line for line in figure.axes[0].lines if "seed" in line.get_label()]
-        assert [line.get_xydata()[0].tolist() for line in means] == [[10240, first]] * 2
+        assert [line.get_xydata()[0].tolist() for line in means] == [[50, first]] * 2
         assert [line.get_ydata()[-1] for line in means] == last
     figures.draw(("learning",), out=tmp_path)
     with Image.open(tmp_path / "results" / "fig-6-return.png") as picture:
@@ -262,7 +264,7 @@ def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("evaluate.trajectories_figure", lambda *_, **__: Figure())
     navigators = ["secant", "parallel"]
-    table = grid.evaluation(navigators, folder=Path("runs/comparison"), trips=3)
+    table = grid.evaluation(navigators, folder=Path("runs/paper-run"), trips=3)
     assert [list(episodes) for episodes in table.episodes] == [list(COLUMNS)]
     assert len(table.episodes[0]) == 6
     assert [row[0] for row in rows(table.text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]

@@ -4,18 +4,20 @@ import math
 
 import plots
 import pytest
+from pandas import DataFrame
 
 from magrl.envs import named_trips
 from magrl.field import IGRF
 
 
-def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
-    """Two runs, of which one ends earlier and one has a gap; a navigator without values has no line."""
-    runs = [([0, 100], [0.0, 50.0]), ([0, 50, 80], [10.0, math.nan, 90.0])]
-    axes = plots.learning_curves({"td3": runs, "gg_td3": [([0], [math.nan])]}, "SPL [%]", points=3).axes[0]
+def test_learning_curves_show_the_mean_over_the_common_episodes() -> None:
+    """Two runs, of which one ends earlier and one has a gap."""
+    runs = ((0, 0, 0.0), (0, 50, 50.0), (1, 0, 10.0), (1, 50, 90.0), (1, 100, 70.0), (0, 100, math.nan), (1, 150, 9.0))
+    data = DataFrame(runs, columns=["run", "episodes", "spl"]).assign(navigator="td3")
+    axes = plots.learning_curves(data, "spl", "SPL [%]").axes[0]
     (mean,) = [line for line in axes.lines if line.get_label() == "TD3, 2 seeds"]
-    assert mean.get_xdata().tolist() == [0, 40, 80]
-    assert mean.get_ydata().tolist() == [5, 35, 65]
+    assert mean.get_xdata().tolist() == [0, 50]
+    assert mean.get_ydata().tolist() == [5, 70]
     assert len(axes.lines) == 3
 
 
