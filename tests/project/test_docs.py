@@ -229,14 +229,17 @@ def test_tables_are_those_that_were_measured(page: Path) -> None:
 
 
 def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() -> None:
-    results = (ROOT / "docs/results/paper-run.md").read_text(encoding="utf-8")
-    results = publish.selected(results, "navigator | SR % | SPL % | TNT steps")
-    lines = TEXTS[ROOT / "docs/reproduction.md"].partition("| steps |\n")[2].splitlines()[1:5]
-    for line, result in zip(lines, results.splitlines()[2:], strict=True):
-        name, *shown = (cell.strip() for cell in line.strip("|").split("|"))
-        agent, *measured = (cell.strip() for cell in result.strip("|").split("|"))
-        assert name.startswith(agent)
-        assert shown == [cell.partition(" ")[0] for cell in measured]
+    """Rows of the paper stand before ours, and the first four are of the trained agents."""
+    files = [ROOT / f"docs/results/{name}.md" for name in ("paper-run", "populations")]
+    columns = "navigator | SR % | TL m | SPL % | TNT steps"
+    tables = [publish.selected(file.read_text(encoding="utf-8"), columns).splitlines()[2:] for file in files]
+    lines = TEXTS[ROOT / "docs/reproduction.md"].partition("| verdict |\n")[2].splitlines()[1:6]
+    results = [[cell.strip() for cell in row.strip("|").split("|")] for row in (*tables[0][:4], *tables[1])]
+    for line, published, measured in zip(lines, results[::2], results[1::2], strict=True):
+        name, *shown = (cell.strip() for cell in line.strip("|").split("|")[:5])
+        assert name.startswith(measured[0])
+        pairs = zip(measured[1:], published[1:], strict=True)
+        assert shown == [f"{here.partition(' ')[0]} / {there}" for here, there in pairs]
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("docs/results/*.csv.gz")), ids=lambda path: path.name)
