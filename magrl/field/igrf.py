@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from bisect import bisect_left
 from functools import cache
 from importlib.util import find_spec
 from numbers import Real
@@ -10,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from magrl.checks import short
@@ -49,27 +49,40 @@ def parse_date(date: Date) -> datetime.datetime:
     return start + datetime.timedelta(seconds=float(date - year) * (end - start).total_seconds())
 
 
+def decimal_year(when: datetime.datetime) -> float:
+    """Return a naive UTC ``datetime`` as a decimal year, the unit of time in which models of the field are linear.
+
+    Example:
+        >>> decimal_year(datetime.datetime(2022, 7, 2, 12))
+        2022.5
+    """
+    start, end = datetime.datetime(when.year, 1, 1), datetime.datetime(when.year + 1, 1, 1)
+    return when.year + (when - start) / (end - start)
+
+
 GENERATIONS = 13, 14
 """Generations of IGRF."""
 
 
 @cache
-def _igrf_tables(generation: int) -> tuple[NDArray[np.datetime64], NDArray[np.complex128]]:
-    """Return epochs ``(E,)`` and complex Gauss tables ``(E, N + 1, N + 1)`` of one IGRF generation, from ppigrf."""
+def _igrf_tables(generation: int) -> tuple[list[float], Tensor]:
+    """Return epochs ``(E,)`` [decimal year] and complex Gauss tables ``(E, N + 1, N + 1)`` of one IGRF generation."""
     if not isinstance(generation, int) or generation not in GENERATIONS:
         raise ValueError(f"IGRF generation {generation!r} is not available: choose from {list(GENERATIONS)}")
-    path = Path(find_spec("ppigrf").origin).with_name(f"IGRF{generation}.shc")  # type: ignore[union-attr, arg-type]
+    path = Path(__file__).with_name("igrf13.shc")  # in the file of ppigrf 73 coefficients are off, by up to 0.3 nT
+    if generation != 13:
+        path = Path(find_spec("ppigrf").origin).with_name(f"IGRF{generation}.shc")  # type: ignore[union-attr, arg-type]
     text = path.read_text(encoding="utf-8")  # by hand, as ppigrf imports pandas
     _, years, *rows = (line for line in text.splitlines() if not line.startswith("#"))
     numbers = np.loadtxt(rows)
     (n, m), table = numbers[:, :2].astype(int).T, np.zeros((numbers.shape[1] - 2, 14, 14), dtype=np.complex128)
     for sign, unit in ((m >= 0, 1), (m < 0, -1j)):
         table[:, n[sign], abs(m[sign])] += unit * numbers[sign, 2:].T
-    return np.array([f"{float(year):.0f}-01-01" for year in years.split()], "M8[us]"), table
+    return list(map(float, years.split())), torch.from_numpy(table)
 
 
 def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
-    """Return the Gauss coefficients at a date, linear in time between the model's epochs.
+    """Return the Gauss coefficients at a date, linear in decimal years between the model's epochs.
 
     Args:
         date: see :data:`Date`.
@@ -82,24 +95,24 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
         ValueError: for another generation, or a date outside the model, with its valid span.
 
     Source:
-        Coefficient files distributed with ppigrf (IAGA IGRF-13 and IGRF-14).
+        ``igrf13.shc``, the file of IAGA and the British Geological Survey; IGRF-14 as distributed with ppigrf.
 
     Example:
         >>> round(float(igrf_coefficients("2020-01-01")[1, 0].real), 2)
         -29403.41
     """
-    when, (epochs, tables) = np.datetime64(parse_date(date), "us"), _igrf_tables(generation)
-    if not epochs[0] <= when <= epochs[-1]:
-        first, last = epochs[[0, -1]].astype("M8[D]")
+    when, (epochs, tables) = parse_date(date), _igrf_tables(generation)
+    year = decimal_year(when)
+    if not epochs[0] <= year <= epochs[-1]:
         newest = GENERATIONS[-1]
-        hint = f": generation={newest} is valid then" if epochs[0] <= when <= _igrf_tables(newest)[0][-1] else ""
+        hint = f": generation={newest} is valid then" if epochs[0] <= year <= _igrf_tables(newest)[0][-1] else ""
         raise ValueError(
-            f"date {when.item().isoformat()} is outside IGRF-{generation}, which is valid from {first} to {last}{hint}"
+            f"date {when.isoformat()} is outside IGRF-{generation}, which is valid from {epochs[0]:.0f}-01-01 to "
+            f"{epochs[-1]:.0f}-01-01{hint}"
         )
-    right = np.searchsorted(epochs, when).clip(1)
-    share = float((when - epochs[right - 1]) / (epochs[right] - epochs[right - 1]))
-    before, after = torch.from_numpy(tables[right - 1 : right + 1])
-    return (1 - share) * before + share * after
+    right = max(bisect_left(epochs, year), 1)
+    share = (year - epochs[right - 1]) / (epochs[right] - epochs[right - 1])
+    return (1 - share) * tables[right - 1] + share * tables[right]
 
 
 class IGRF(SphericalHarmonicField):
@@ -117,12 +130,12 @@ class IGRF(SphericalHarmonicField):
 
     Source:
         Alken et al., International Geomagnetic Reference Field: the thirteenth generation, EPS 73 (2021);
-        coefficients as distributed with ppigrf.
+        coefficients of :func:`igrf_coefficients`.
 
     Example:
         >>> igrf = IGRF("2022-01-01", generation=13)
         >>> igrf(torch.tensor(-2.0), torch.tensor(162.0)).round()
-        tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
+        tensor([ 35121.,   4948., -10271.], dtype=torch.float64)
     """
 
     def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0) -> None:

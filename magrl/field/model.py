@@ -93,7 +93,7 @@ def elements_at(field: Any, position: Tensor, index: Tensor | None = None) -> Te
         >>> from magrl.field import IGRF
         >>> paper = IGRF("2022-01-01", generation=13)
         >>> [round(x, 2) for x in elements_at(paper, torch.tensor([-2.0, 162.0])).tolist()]
-        [8.02, -16.15, 35466.61]
+        [8.02, -16.15, 35467.99]
     """
     return measured_elements(field(*_place(field, position, index)))
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magrl.field.igrf import Date, parse_date
+from magrl.field.igrf import Date, decimal_year, parse_date
 from magrl.field.spherical import SphericalHarmonicField
 
 WMMHR_SHA256 = "8851d40e57a1d948cb56d49b837612844890a941f93a73846a122b6c1182d504"
@@ -66,10 +66,8 @@ def wmmhr_coefficients(date: Date) -> Tensor:
         raise ValueError(
             f"date {when.isoformat()} is outside WMMHR-2025, which is valid from {EPOCH.date()} to {END.date()}"
         )
-    start, end = datetime.datetime(when.year, 1, 1), datetime.datetime(when.year + 1, 1, 1)
-    years = when.year - EPOCH.year + (when - start) / (end - start)
     at_epoch, rate = _wmmhr_tables()
-    return at_epoch + years * rate
+    return at_epoch + (decimal_year(when) - EPOCH.year) * rate
 
 
 class WMMHR(SphericalHarmonicField):
