@@ -10,6 +10,7 @@ from support.tracks import f64
 from magrl.geodesy import (
     WGS84_A_KM,
     WGS84_B_KM,
+    WGS84_F,
     check_box,
     check_positions,
     curvature_radii,
@@ -60,7 +61,15 @@ def test_wrapped_angles_are_the_same_in_the_half_open_turn(wrap, half, dtype):
 
 
 def test_positions_and_their_frames():
-    """On the axes by hand; elsewhere, the derivatives of a position are its radii of curvature along its frame."""
+    """On the axes by hand; elsewhere, the derivatives of a position are its radii of curvature along its frame.
+
+    The point off the axes is the example in the technical report of WMM2025 (Table 3a, doi:10.25923/prbc-s316).
+    """
+    assert (KARNEY.a, KARNEY.f) == (1e3 * WGS84_A_KM, WGS84_F)
+    place = to_ecef(*f64(-80, 240, 100))
+    radius_km = float(place.norm())
+    assert radius_km == pytest.approx(6457.4023484473705, rel=0, abs=1e-11)
+    assert math.asin(float(place[2]) / radius_km) == pytest.approx(-1.3951289589, rel=0, abs=5.1e-11)
     axes = f64(0, 0, 0, 0, 90, 2, 0, 180, 0, 90, 33, 1, -90, -70, 0).reshape(5, 3)
     wanted = f64(WGS84_A_KM, 0, 0, 0, WGS84_A_KM + 2, 0, -WGS84_A_KM, 0, 0, 0, 0, WGS84_B_KM + 1, 0, 0, -WGS84_B_KM)
     torch.testing.assert_close(to_ecef(*axes.unbind(1)), wanted.reshape(5, 3), rtol=0, atol=1e-11)

@@ -56,6 +56,8 @@ def splitmix_finalizer(value):
 
 def test_the_generator_is_the_one_it_names():
     golden = 0x9E3779B97F4A7C15
+    first = [splitmix_finalizer((1234567 + k * golden) % 2**64) for k in (1, 2, 3)]
+    assert first == [6457827717110365317, 3203168211198807973, 9817491932198370423]  # as other programs print them
     for seed, counter in ((0, 0), (1, 5), (-3, 12345), (2**63, -1), (2**64 - 1, 3)):
         key = splitmix_finalizer(seed % 2**64)
         key = splitmix_finalizer(key ^ splitmix_finalizer((counter + golden) % 2**64))

@@ -33,7 +33,15 @@ def ramp(minutes: int = 600) -> WeatherRecord:
 
 
 def test_records_are_those_of_the_observatories() -> None:
-    """Values of the first minute in the file of Boulder, X, Y, Z, less the quiet level."""
+    """Values of the first minute in the file of Boulder, X, Y, Z, less the quiet level.
+
+    In the files of variometers, the length of a horizontal change does not depend on their axes. Since the first
+    minute, H, D change from 20873.75, -9.99' to 20804.34, -2.42' at Boulder, and H, E from 12412.33, -445.58 to
+    12185.93, -468.71 at College; Z by -21.41 and -244.11.
+    """
+    for name, minute, across, down in (("boulder-2014", 9687, 83.21, -21.41), ("college", 637, 227.58, -244.11)):
+        change = weather_record(name).variation[minute] - weather_record(name).variation[0]
+        assert [change[:2].norm().item(), change[2].item()] == pytest.approx([across, down], rel=0, abs=0.11)
     level = torch.tensor([20538.42, 3147.88, 47920.22])  # median of 18 January 2016
     first = torch.tensor([20428.79, 3123.15, 47956.69])
     torch.testing.assert_close(weather_record("quiet").variation[0], first - level, atol=0.06, rtol=0)

@@ -17,8 +17,9 @@ from magrl.envs import Scenario
 from magrl.errors import NORTH_REFERENCES, MagneticNorth, MotionError, NorthReferenceError, north_reference
 from magrl.errors.base import true_keys
 from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
+from magrl.errors.north import SCHULER_HOURS
 from magrl.evaluation import Flight, evaluate
-from magrl.geodesy import geodesic, move
+from magrl.geodesy import MEAN_RADIUS_KM, geodesic, move
 from magrl.sensor_std import SensorStd
 
 F64 = torch.float64
@@ -155,6 +156,8 @@ def test_parts_of_the_error_have_their_sizes() -> None:
 @pytest.mark.parametrize("name", NORTH_REFERENCES)
 def test_references_on_the_market(name: str) -> None:
     """The total of the standards' limits, read as two standard deviations; tan(latitude) is tan(I) / 2 of a dipole."""
+    pendulum_s = math.tau * math.sqrt(MEAN_RADIUS_KM * 1e3 / 9.80665)  # as long as the radius of the Earth
+    assert pendulum_s / 3600 == pytest.approx(SCHULER_HOURS, abs=5e-4)
     error = north_reference(name, speed_km_h=20.0)
     total = {"fiber-optic": 0.1, "marine": math.hypot(0.375, 0.125, 0.25), "low-cost": math.hypot(0.5, 0.75)}
     state = TransformedEnv(nav(), error).reset()

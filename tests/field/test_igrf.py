@@ -170,14 +170,17 @@ def test_coefficients_are_those_of_the_published_file() -> None:
 
 
 def test_wmmhr_gives_its_published_values(wmmhr) -> None:
-    """At heights of 3 to 93 km, at its epoch and 4.5 years later; its change in time is linear and of degree 15."""
+    """At heights of 3 to 93 km, at its epoch and 4.5 years later; its change in time is linear and of degree 15.
+
+    North is published with another rounding: a synthesis in 30 digits agrees with ours to 4e-11 nT.
+    """
     table = torch.from_numpy(np.loadtxt(DATA / "wmmhr2025_test_values.txt"))
     years, altitude_km, latitude, longitude = table[:, :4].T
     rate = (wmmhr_coefficients(2029.5) - wmmhr_coefficients(2025.0)) / 4.5
     change = SphericalHarmonicField(rate[:16, :16])(latitude, longitude, altitude_km)
     found = wmmhr(latitude, longitude, altitude_km) + (years - 2029.5).unsqueeze(-1) * change
     assert table.shape == (16, 10)
-    assert (found - table[:, 4:7]).abs().max() < 1e-3
+    assert ((found - table[:, 4:7]).abs().amax(0) < f64(4e-4, 2e-6, 2e-6)).all()
     assert (change - table[:, 7:]).abs().max() < 1e-5
     assert not rate[16:].any()
 

@@ -156,7 +156,12 @@ def wmm2025(year):
 
 
 def test_another_model_gives_its_published_values():
-    """WMM2025, whose table is printed to 0.1 nT and 0.01 degrees, sea level and 100 km high, now and in 2027.5."""
+    """WMM2025, whose table is printed to 0.1 nT and 0.01 degrees, sea level and 100 km high, now and in 2027.5.
+
+    The technical report has more digits of one row (Table 3b, doi:10.25923/prbc-s316).
+    """
+    found = SphericalHarmonicField(wmm2025(2027.5))(f64(-80.0), f64(240.0), 100.0)[0]
+    assert found.tolist() == pytest.approx([5983.9760496518, 14760.1359757868, -49317.6706154255], rel=0, abs=1e-9)
     table = np.loadtxt(DATA / "wmm2025_test_values.txt")
     assert table.shape == (12, 11)
     for year, altitude_km, latitude, longitude, *published in table.tolist():
@@ -246,6 +251,21 @@ def dipoles(planets: Tensor) -> Tensor:
 def coefficients(planets: Tensor, n: int) -> Tensor:
     """The 2n + 1 coefficients g and h of a degree, ``(count, 2n + 1)``."""
     return torch.cat((planets[:, n, : n + 1].real, planets[:, n, 1 : n + 1].imag), -1)
+
+
+def test_power_is_the_mean_square_field_on_the_sphere() -> None:
+    """By quadrature, exact for degree 6: Gauss' in the sine of the latitude, equal steps in longitude."""
+    table = random_table(3, 9)
+    sine, weight = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(8))
+    longitude = torch.arange(16, dtype=torch.float64) * math.tau / 16
+    across = torch.sqrt(1 - sine**2).unsqueeze(1)
+    points = torch.stack((across * longitude.cos(), across * longitude.sin(), sine.unsqueeze(1).expand(8, 16)), -1)
+    for n in (1, 2, 3):
+        one = torch.zeros_like(table)
+        one[n] = table[n]
+        field = field_table(one) @ basis(REFERENCE_RADIUS_KM * points.reshape(-1, 3), 4)
+        square = field.square().sum(0).reshape(8, 16).mean(1) @ weight / 2
+        assert square.item() == pytest.approx(power_spectrum(table)[n].item(), rel=1e-12), n
 
 
 def test_the_spectrum_is_the_earth_s(planets: Tensor) -> None:
