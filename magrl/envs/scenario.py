@@ -250,7 +250,7 @@ class Scenario(EpisodeRules):
         Example:
             >>> scenario = Scenario(objective_floors=None)
             >>> scenario.floors(scenario.build_field()).round(decimals=2)
-            tensor([[ 0.0500,  0.4400, 21.1100]], dtype=torch.float64)
+            tensor([[ 0.0500,  0.4400, 21.1300]], dtype=torch.float64)
         """
         count = len(self.region)
         if self.objective_floors is not None:
