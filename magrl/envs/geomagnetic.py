@@ -210,6 +210,15 @@ class GeomagneticNavEnv(EnvBase):
 
     # Reset
 
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Set the seed; return the next one, of another environment: reserved for evaluations if this one is.
+
+        TorchRL's next seed is any number below 2**32.
+        """
+        following = super().set_seed(seed, static_seed)
+        reserved = self.seed >= FIRST_RESERVED_SEED
+        return following if static_seed else following % FIRST_RESERVED_SEED + reserved * FIRST_RESERVED_SEED
+
     def _set_seed(self, seed: Any) -> None:
         check_number(0, 2**64 - 1, whole=True, seed=seed)
         self.seed = int(seed)

@@ -27,6 +27,7 @@ from magrl.field import IGRF, RegionalField
 from magrl.geodesy import move
 from magrl.navigators import load_policy
 from magrl.pilot.network import pretrained
+from magrl.random_numbers import FIRST_RESERVED_SEED
 
 ANTIMERIDIAN = Region((-5.0, 5.0), (175.0, 185.0))
 
@@ -311,6 +312,16 @@ def test_a_seed_gives_the_rollout_and_set_seed_starts_over() -> None:
         env.set_seed(None)
     for copied in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
         assert_same(seeded(copied), second)
+
+
+@pytest.mark.parametrize("first", [0, FIRST_RESERVED_SEED + 5])
+def test_seeds_of_several_environments_are_reserved_as_the_first_one_is(first: int) -> None:
+    several, collector = SerialEnv(16, make), Collector(make(), frames_per_batch=1, total_frames=1)
+    collector.set_seed(several.set_seed(first))
+    seeds = [env.seed for env in (*several._envs, collector.env)]
+    assert len({*seeds}) == 17
+    assert {seed >= FIRST_RESERVED_SEED for seed in seeds} == {first > 0}
+    assert [make().set_seed(seed, static_seed=True) for seed in seeds] == seeds
 
 
 def test_random_headings_fill_the_circle() -> None:
