@@ -194,8 +194,8 @@ def train(config: Config) -> dict[str, float]:
         critic = make_critic(env.view.size, config.num_cells, **shape, device=env.device)
 
         # Loss, with clipped double Q and target policy smoothing
-        loss = TD3Loss(actor, critic, **config.model_dump(include={"gamma", "policy_noise", "noise_clip"}))
-        loss.set_keys(terminated="done" if config.time_limit_ends else "terminated")
+        options = config.model_dump(include={"gamma", "policy_noise", "noise_clip"})
+        loss = TD3Loss(actor, critic, **options, terminated="done" if config.time_limit_ends else "terminated")
         target_update = SoftUpdate(loss, tau=config.tau)
         critic_optimizer = Adam(loss.critic_parameters(), lr=config.learning_rate, fused=True)
         actor_optimizer = Adam(loss.actor_parameters(), lr=config.learning_rate, fused=True)

@@ -1,4 +1,4 @@
-"""TD3: TorchRL's loss with a separate network for each role, for feedforward actors.
+"""TD3: a loss with a separate network for each role, for feedforward actors.
 
 Source: Fujimoto, van Hoof and Meger, Addressing function approximation error in actor-critic methods, ICML 2018.
 """
@@ -7,56 +7,40 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Bounded
+from torch.func import functional_call
 from torchrl.modules import ValueOperator
-from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
 from magrl.checks import check_number, check_type
 
 
-class Networks(NamedTuple):
-    """The networks of a :class:`TD3Loss`, which share the memory of its parameters.
-
-    Example:
-        >>> Networks._fields
-        ('actor', 'target_actor', 'critics', 'target_critics', 'frozen_critic')
-    """
-
-    actor: Any
-    target_actor: Any
-    critics: list[nn.Module]
-    target_critics: list[nn.Module]
-    frozen_critic: nn.Module
-
-
-class TD3Loss(TorchRLTD3Loss):
-    """TorchRL's TD3 loss with equal values and gradients at a lower cost (``make bench``).
+class TD3Loss(nn.Module):
+    """The loss of TD3, with the values and gradients of TorchRL's at a lower cost (``make bench``).
 
     TorchRL's class fills one network with the parameters of each role at every call, and evaluates both critics for the
-    actor. This one keeps a network for each role, on the parameters, targets and state of the parent. Move actor and
-    critic to their device before the loss is made.
+    actor. This one holds a network for each role, so that it is copied, moved, cast and optimized as any module is.
 
     Args:
-        actor: writes ``logits`` and ``action`` ``(..., 2)`` in [-1, 1].
-        critic: reads observations and ``action``, in this order, by a module of one concatenated input.
+        actor: writes ``logits`` and ``action`` ``(..., 2)`` in [-1, 1]; it is trained in place.
+        critic: reads observations and ``action``, in this order, by a module of one concatenated input; a model of both
+            critics, whose weights TorchRL draws.
         gamma: discount factor.
         policy_noise: standard deviation of the noise of target policy smoothing.
         noise_clip: largest noise of target policy smoothing.
+        terminated: key of the end after which no value is expected; ``"done"`` counts a step limit as one.
 
     Raises:
         TypeError: for an actor or a critic of another type.
         ValueError: for a discount outside [0, 1] or a negative noise.
 
     Example:
-        >>> from tensordict import TensorDict
         >>> from magrl.navigators.networks import make_actor, make_critic
         >>> loss = TD3Loss(make_actor(13, (8,)), make_critic(13, (8,)), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
         >>> update = SoftUpdate(loss, tau=0.01)
@@ -75,49 +59,41 @@ class TD3Loss(TorchRLTD3Loss):
         gamma: float,
         policy_noise: float,
         noise_clip: float,
+        terminated: NestedKey = "terminated",
     ) -> None:
+        super().__init__()
         check_type(TensorDictSequential, actor=actor)
         check_type(ValueOperator, critic=critic)
         check_number(0, 1, gamma=gamma)
         check_number(0, policy_noise=policy_noise, noise_clip=noise_clip)
-        super().__init__(
-            actor,
-            critic,
-            action_spec=Bounded(-1.0, 1.0, (2,), device=next(actor.parameters()).device),
-            loss_function="l2",
-            policy_noise=policy_noise,
-            noise_clip=noise_clip,
-            deactivate_vmap=True,  # each critic is a module of its own
-        )
-        self.make_value_estimator(gamma=gamma)
-
-    @cached_property
-    def networks(self) -> Networks:
-        """A network for each role, on the parameters of the loss."""
-        critics, targets = (p.data.unbind(0) for p in (self.qvalue_network_params, self.target_qvalue_network_params))
-        return Networks(
-            actor=_holding(self.actor_network, self.actor_network_params),
-            target_actor=_holding(self.actor_network, self.target_actor_network_params.data),
-            critics=[_holding(self.qvalue_network, params).module.requires_grad_() for params in critics],
-            target_critics=[_holding(self.qvalue_network, params).module for params in targets],
-            # Without this, the loss of the actor would compute gradients of the critic's weights, too
-            frozen_critic=_holding(self.qvalue_network, critics[0]).module.requires_grad_(False),
-        )
+        self.gamma, self.policy_noise, self.noise_clip, self.terminated = gamma, policy_noise, noise_clip, terminated
+        self.observed = critic.in_keys[:-1]
+        drawn = TorchRLTD3Loss(actor, critic, bounds=(-1.0, 1.0)).qvalue_network_params.data.clone().unbind(0)
+        self.actor, self.critics = actor, nn.ModuleList(_holding(critic, weights).module for weights in drawn)
+        self.target_actor, self.target_critics = copy.deepcopy((self.actor, self.critics))
+        self.target_actor.requires_grad_(False)
+        self.target_critics.requires_grad_(False)
 
     def actor_parameters(self) -> list[Tensor]:
         """Return the parameters that the actor's optimizer trains."""
-        return list(self.actor_network_params.parameters())
+        return list(self.actor.parameters())
 
     def critic_parameters(self) -> list[Tensor]:
         """Return the parameters that the critics' optimizer trains."""
-        return [weight for critic in self.networks.critics for weight in critic.parameters()]
+        return list(self.critics.parameters())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return ``loss_actor`` and ``loss_qvalue``, whose sum TorchRL's trainers minimize, and ``target_value``."""
+        loss_actor, _ = self.actor_loss(tensordict)
+        loss_qvalue, values = self.value_loss(tensordict)
+        return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, **values})
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of both critics (Eqs. (15) to (17)).
 
         Args:
             tensordict: ``(B,)`` transitions: observations, ``action``, and in ``next`` observations, ``reward`` and
-                ``terminated``, or what ``set_keys(terminated=...)`` names.
+                ``terminated``, or the key that stands for it.
 
         Returns:
             A scalar, and ``target_value`` ``(B, 1)``.
@@ -126,15 +102,14 @@ class TD3Loss(TorchRLTD3Loss):
         noise = (torch.randn_like(action) * self.policy_noise).clamp(-self.noise_clip, self.noise_clip)
         with torch.inference_mode():
             # Target policy smoothing: noise on the action of the target actor
-            next_action = self.networks.target_actor(after.select(*self.actor_network.in_keys))["action"]
-            next_action = (next_action + noise).clamp(self.min_action, self.max_action)
+            next_action = self.target_actor(after.select(*self.actor.in_keys))["action"]
+            next_action = (next_action + noise).clamp(-1.0, 1.0)
             # Clipped double Q: the smaller value of the two target critics
             next_obs_action = self._critic_input(after, next_action)
-            target_q = torch.minimum(*(critic(next_obs_action) for critic in self.networks.target_critics))
-            alive = (~after[self.tensor_keys.terminated]).to(target_q.dtype)
-            target_value = after["reward"] + self.value_estimator.gamma * alive * target_q
+            target_q = torch.minimum(*(critic(next_obs_action) for critic in self.target_critics))
+            target_value = after["reward"] + self.gamma * (~after[self.terminated]).to(target_q.dtype) * target_q
         obs_action = self._critic_input(tensordict, action)
-        q1, q2 = (critic(obs_action) for critic in self.networks.critics)
+        q1, q2 = (critic(obs_action) for critic in self.critics)
         loss = ((q1 - target_value).square() + (q2 - target_value).square()).mean()
         return loss, {"target_value": target_value}
 
@@ -147,23 +122,32 @@ class TD3Loss(TorchRLTD3Loss):
         Returns:
             A scalar, and all outputs of the actor with their gradient, such as ``logits`` and ``action``.
         """
-        outputs = self.networks.actor(tensordict.select(*self.actor_network.in_keys))
-        q1 = self.networks.frozen_critic(self._critic_input(tensordict, outputs["action"]))
-        return -q1.mean(), {key: outputs[key] for key in self.actor_network.out_keys}
+        outputs = self.actor(tensordict.select(*self.actor.in_keys))
+        # Detached, or the loss of the actor would compute gradients of the critic's weights, too
+        weights = {name: weight.detach() for name, weight in self.critics[0].named_parameters()}
+        q1 = functional_call(self.critics[0], weights, self._critic_input(tensordict, outputs["action"]))
+        return -q1.mean(), {key: outputs[key] for key in self.actor.out_keys}
 
     def _critic_input(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        return torch.cat([*(tensordict[key] for key in self.qvalue_network.in_keys[:-1]), action], -1)
+        return torch.cat([*(tensordict[key] for key in self.observed), action], -1)
 
 
-def _holding(network: nn.Module, params: Any) -> Any:
-    """Return a copy of a network that holds some parameters, sharing their memory."""
+def _holding(network: nn.Module, weights: TensorDictBase) -> Any:
+    """Return a copy of a network that holds some weights."""
     copied = copy.deepcopy(network)
-    params.to_module(copied, preserve_module_state=True)  # optimizers take the parameters of the copies
-    return copied
+    weights.to_module(copied, preserve_module_state=True)
+    return copied.requires_grad_()
 
 
-class SoftUpdate(TorchRLSoftUpdate):
-    """TorchRL's Polyak averaging of the target networks, in one call for all parameters.
+class SoftUpdate:
+    """Polyak averaging of the target networks of a loss.
+
+    Args:
+        loss: loss.
+        tau: share by which each target moves towards its source.
+
+    Raises:
+        ValueError: for a share outside [0, 1].
 
     Example:
         >>> from magrl.navigators.networks import make_actor, make_critic
@@ -171,14 +155,17 @@ class SoftUpdate(TorchRLSoftUpdate):
         >>> SoftUpdate(loss, tau=0.25).step()
     """
 
+    def __init__(self, loss: TD3Loss, *, tau: float) -> None:
+        check_number(0, 1, tau=tau)
+        self.loss, self.tau = loss, tau
+
+    @torch.no_grad()
     def step(self) -> None:
         """Move each target parameter by the share ``tau`` towards its source."""
-        targets, sources = self._pair
-        targets.lerp_(sources, 1 - self.eps)
-
-    @cached_property
-    def _pair(self) -> tuple[TensorDictBase, TensorDictBase]:
-        return self._targets.data, self._sources.data
+        pairs = (self.loss.target_actor, self.loss.actor), (self.loss.target_critics, self.loss.critics)
+        for targets, sources in pairs:
+            for target, source in zip(targets.parameters(), sources.parameters(), strict=True):
+                target.lerp_(source, self.tau)
 
 
 def saturation_penalty(logits: Tensor) -> Tensor:

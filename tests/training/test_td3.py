@@ -1,11 +1,14 @@
 """TD3: the loss beside TorchRL's and by hand, target networks and gradient steps."""
 
+import copy
 import math
+import pickle
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
+from torchrl.objectives import SoftUpdate as StockSoftUpdate
 from torchrl.objectives import TD3Loss as StockTD3Loss
 
 from magrl.navigators import make_actor, make_critic
@@ -14,15 +17,9 @@ from magrl.training import SoftUpdate, TD3Loss, optimize
 CELLS = (16, 16)
 
 
-def make_loss(size: int = 13, *, policy_noise: float = 0.1) -> TD3Loss:
+def make_loss(size: int = 13, *, policy_noise: float = 0.1, **options: str) -> TD3Loss:
     actor, critic = make_actor(size, CELLS), make_critic(size, CELLS)
-    return updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=1.2))
-
-
-def updated(loss: StockTD3Loss) -> StockTD3Loss:
-    """Return a loss whose targets are updated, as TorchRL expects of every loss."""
-    SoftUpdate(loss, tau=0.1)
-    return loss
+    return TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=1.2, **options)
 
 
 def transitions(size: int = 13, count: int = 32) -> TensorDict:
@@ -51,55 +48,67 @@ def test_loss_is_that_of_torchrl() -> None:
         optimize(ours.value_loss(batch)[0] + ours.actor_loss(batch)[0], optimizer)
         update.step()
     spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 1.0, "noise_clip": 1.2}
-    stock = updated(StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec))
+    stock = StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec)
     stock.make_value_estimator(gamma=0.9)
-    stock.load_state_dict(ours.state_dict())
+    StockSoftUpdate(stock, tau=0.1)  # as TorchRL expects of every loss
+    for params, networks in (("actor_network", ours.actor), ("target_actor_network", ours.target_actor)):
+        getattr(stock, f"{params}_params").data.update_(TensorDict.from_module(networks).data)
+    for params, networks in (("qvalue_network", ours.critics), ("target_qvalue_network", ours.target_critics)):
+        weights = torch.stack([TensorDict.from_module(critic).data for critic in networks])
+        getattr(stock, f"{params}_params").data.update_(TensorDict(module=weights, batch_size=[2]))
     batch, computed = transitions(), []
     for loss in (ours, stock):
         torch.manual_seed(1)
-        value, actor = loss.value_loss(batch.clone())[0], loss.actor_loss(batch.clone())[0]
-        policy = [p for p in loss.actor_network_params.parameters() if p.requires_grad]
+        values = loss(batch.clone())
+        actor, value = values["loss_actor"], values["loss_qvalue"]
         if loss is ours:
-            gradients = torch.autograd.grad(value, loss.critic_parameters())
-            critics = [torch.stack(pair) for pair in zip(gradients[:10], gradients[10:], strict=True)]
+            policy, weights = loss.actor_parameters(), loss.critic_parameters()
+            critics = torch.autograd.grad(value, weights)
+            critics = [torch.stack(pair) for pair in zip(critics[:10], critics[10:], strict=True)]
         else:
+            policy = [p for p in loss.actor_network_params.parameters() if p.requires_grad]
             critics = torch.autograd.grad(value, list(loss.qvalue_network_params.parameters()))
-        computed.append([value, actor, *critics, *torch.autograd.grad(actor, policy)])
-    assert len(computed[0]) == 2 + 10 + 10  # two hidden layers with their normalization, and the last
+        computed.append([value, actor, values["target_value"].flatten(), *critics, *torch.autograd.grad(actor, policy)])
+    assert len(computed[0]) == 3 + 10 + 10  # two hidden layers with their normalization, and the last
     for mine, theirs in zip(*computed, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-8)
 
 
-def test_networks_hold_parameters_that_share_the_memory_of_the_loss() -> None:
+@pytest.mark.parametrize("used", [False, True])
+def test_a_copy_and_another_type_train_all_weights_and_leave_the_targets(used: bool) -> None:
+    """By an optimizer of all parameters, as of TorchRL's trainer, before or after the first use; no loss of another."""
     loss = make_loss()
-    critics, targets = loss.qvalue_network_params, loss.target_qvalue_network_params
-    networks, actors = loss.networks, (loss.actor_network_params, loss.target_actor_network_params)
-    pairs = [(networks.actor, actors[0]), (networks.target_actor, actors[1]), (networks.frozen_critic, critics[0])]
-    pairs += zip([*networks.critics, *networks.target_critics], [*critics, *targets], strict=True)
-    for network, params in pairs:
-        assert len(list(network.parameters())) == 10  # two hidden layers with their normalization, and the last
-        addresses = {value.data_ptr() for value in (*network.parameters(), *network.buffers())}
-        assert addresses == {value.data_ptr() for value in params.data.values(True, True)}
+    if used:
+        loss(transitions())
+    before = {name: value.detach().clone() for name, value in loss.named_parameters()}
+    for trained in (copy.deepcopy(loss), pickle.loads(pickle.dumps(loss)), copy.deepcopy(loss)):
+        optimizer = torch.optim.SGD([p for p in trained.parameters() if p.requires_grad], lr=1.0)
+        trained.double()
+        values = trained(transitions().apply(lambda x: x.double() if x.is_floating_point() else x))
+        optimize(values["loss_actor"] + values["loss_qvalue"], optimizer)
+        for name, value in trained.named_parameters():
+            assert value.dtype == torch.float64
+            assert torch.equal(value.float(), before[name]) == name.startswith("target"), name
+    assert all(torch.equal(value, before[name]) for name, value in loss.named_parameters())
 
 
 def test_actor_loss_has_no_gradient_of_the_critics() -> None:
     loss = make_loss()
     loss.actor_loss(transitions())[0].backward()
-    assert all(p.grad.abs().sum() > 0 for p in loss.actor_parameters() if p.requires_grad)
-    critics = (loss.networks.frozen_critic, *loss.networks.critics, *loss.networks.target_critics)
-    assert all(p.grad is None for critic in critics for p in critic.parameters())
+    assert all(p.grad.abs().sum() > 0 for p in loss.actor_parameters())
+    assert all(p.grad is None for p in (*loss.critics.parameters(), *loss.target_critics.parameters()))
 
 
 def test_soft_update_moves_the_targets_by_tau() -> None:
     loss = make_loss()
-    update = SoftUpdate(loss, tau=0.25)  # which makes targets equal to the weights
-    before = loss.target_qvalue_network_params.clone()
+    update, before = SoftUpdate(loss, tau=0.25), copy.deepcopy(dict(loss.named_parameters()))
     with torch.no_grad():
         for weight in (*loss.critic_parameters(), *loss.actor_parameters()):
             weight += 1
     update.step()
-    for key, target in loss.target_qvalue_network_params.items(True, True):
-        torch.testing.assert_close(target, before[key] + 0.25)
+    for name, weight in loss.named_parameters():
+        assert torch.equal(before[name], before[name.removeprefix("target_")])
+        torch.testing.assert_close(weight, before[name] + (0.25 if name.startswith("target") else 1.0))
 
 
 def test_optimize_clips_the_gradient_of_some_parameters() -> None:
@@ -114,9 +123,8 @@ def test_optimize_clips_the_gradient_of_some_parameters() -> None:
 
 def test_a_step_limit_may_count_as_the_end() -> None:
     """No value is expected after it."""
-    loss, batch = make_loss(policy_noise=0.0), transitions()
+    loss, batch = make_loss(policy_noise=0.0, terminated="done"), transitions()
     batch["next"].update({"done": torch.ones(32, 1).bool(), "terminated": torch.zeros(32, 1).bool()})
-    loss.set_keys(terminated="done")
     assert torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
 
 
