@@ -67,6 +67,10 @@ class GeomagneticNavEnv(EnvBase):
             heading and errors, so that an environment of few vehicles with other numbers repeats episodes of a larger
             one.
 
+    ``reset(TensorDict(position=..., target_position=...), set_state=True)`` begins episodes at places of one's own,
+    with ``heading`` and ``region`` if given, and ``reset(state, set_state=True)`` at a state. Transforms begin anew
+    there; to go on from a state with theirs, call ``step`` with it: it is wholly in the TensorDict.
+
     Keys (``N = num_envs``; float32, but positions float64, and counts and indices int64):
 
     - ``action`` ``(N, 2)``: distance [km] and turn [rad]; ``(N, 3)`` where the arrival is declared, by a number above 0
@@ -90,6 +94,7 @@ class GeomagneticNavEnv(EnvBase):
     """
 
     batch_locked = True
+    _supports_set_state = True  # TorchRL's declaration that reset(state, set_state=True) starts from a state
     action_low: Tensor
     action_high: Tensor
     objective_floors: Tensor
@@ -224,12 +229,14 @@ class GeomagneticNavEnv(EnvBase):
         self.seed = int(seed)
         self.episode = torch.zeros_like(self.episode)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
-        """Start the next episode of every vehicle that is named by ``_reset``, or of all."""
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
+        """Start the next episode of every vehicle that is named by ``_reset``, or of all; or all from a state."""
         mask = torch.ones_like(self.vehicle, dtype=torch.bool)
+        from_state = set_state and tensordict is not None and "_reset" not in tensordict.keys()  # noqa: SIM118
         if tensordict is not None:
             mask = tensordict.get("_reset", mask).reshape(self.num_envs)
-        start = self._next_starts(mask)  # the base class puts the running state of the others back
+        # The base class puts the running state of the others back
+        start = self._from_state(tensordict) if from_state else self._next_starts(mask)
         self.episode = self.episode + mask  # out of place: a rollout or a checkpoint may hold the old tensor
         self._tracks.add(start, mask)
         return start
@@ -254,14 +261,36 @@ class GeomagneticNavEnv(EnvBase):
             self._ahead[rows] = self._start_of(rows)
         return self._ahead.clone()  # who is given it may write into it
 
+    def _from_state(self, state: TensorDictBase) -> TensorDict:
+        """Return the observation of a state, or of an episode that begins at some places.
+
+        Raises:
+            KeyError: for a part of a state.
+            ValueError: for a place outside the region.
+        """
+        keys, places, first = set(self.state_spec.keys()), {"position", "target_position"}, {"heading", "region"}
+        given = keys & set(state.keys())
+        if missing := sorted((places if given <= places | first else keys) - given):
+            raise KeyError(
+                f"a state lacks {missing}: give all of {sorted(keys)}, or {sorted(places)} alone, for a start"
+            )
+        region = state.get("region", torch.zeros_like(self.vehicle)).reshape(self.num_envs)
+        ends = torch.stack((state["position"], state["target_position"])).double()
+        if not self.edge.contains(ends, region).all():
+            raise ValueError(f"position and target_position must be in the region and its margin, got {ends.tolist()}")
+        start = self._start_of(torch.arange(self.num_envs, device=self.device), Trips(*ends, region))
+        for key in (given | {"leg"} & set(state.keys())) - places - {"target_field"}:
+            start[key] = state[key].to(start[key])
+        return start
+
     def _streams(self, vehicle: Tensor, episode: Tensor) -> Tensor:
         """Return the stream of random numbers of episodes, ``(P, 1)``, which names an episode of any seed."""
         return counter_stream(self.seed, torch.stack((vehicle, episode), -1)).unsqueeze(-1)
 
-    def _start_of(self, row: Tensor) -> TensorDict:
+    def _start_of(self, row: Tensor, trips: Trips | None = None) -> TensorDict:
         """Return the first observation of the next episode of the vehicles in some rows, ``(P,)``."""
         vehicle, episode = self.vehicle[row], self.episode[row]
-        start, target, region = self._trips(vehicle, episode)
+        start, target, region = self._trips(vehicle, episode) if trips is None else trips
         field, target_field = elements_at(self.field, torch.stack((start, target)), region)
         # Rounded as the vehicle observes it: a leg of length 0 must not change the objective.
         field, target_field = field.float().double(), target_field.float().double()

@@ -162,7 +162,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
     def _start(self, mask: Tensor) -> None:
         """Start the next episodes of some vehicles, ``(N,)`` bool."""
         if mask.any():
-            self._state = self.torchrl_env.reset(self._state.set("_reset", mask.unsqueeze(-1)))
+            self._state = self.torchrl_env.reset(self._state.set("_reset", mask.unsqueeze(-1)), set_state=False)
             self._length_km = self._length_km.masked_fill(mask, 0.0)
 
     def step(self, actions: NDArray[np.float32]) -> VectorStep:

@@ -274,6 +274,32 @@ def test_starts_computed_ahead_do_not_change_with_what_a_reset_returned_or_a_sta
     assert_same(env.reset(), other.reset())
 
 
+@pytest.mark.parametrize("options", [{}, {"drift_km": 20.0, "start_heading": "random", "max_turn_deg": 180.0}])
+def test_a_reset_to_a_state_goes_on_from_there(options: dict[str, Any]) -> None:
+    """In an environment of another seed, too."""
+    env, other = make(3, **options), make(3, **options | {"seed": 7})
+    state, action = env.step_mdp(env.rand_step(env.reset())), random_actions(1, 3)[0]
+    again = other.reset(state.clone(), set_state=True)
+    assert_same(again.select(*state.keys()), state, but=REWARD_TERMS)
+    assert_same(*(each.step(td.set("action", action))["next"] for each, td in ((env, state), (other, again))))
+    with pytest.raises(KeyError, match=r"lacks \[.*'objective_weights'.*'position', 'target_position'\] alone"):
+        env.reset(state.exclude("objective_weights"), set_state=True)
+
+
+def test_episodes_begin_at_places_of_ones_own() -> None:
+    """With their own random numbers, as any episode."""
+    ends = Trips(places(START, HERE), places(TARGET, START))
+    own = TensorDict(position=ends.start, target_position=ends.target, batch_size=[2])
+    for env in (make(2), navigation_env(2, seed=0), SerialEnv(1, lambda: navigation_env(2, seed=0))):
+        given = own.expand(*env.batch_size).clone()
+        first, second = (env.reset(given.clone(), set_state=True).reshape(2) for _ in range(2))
+        expected = make(2, trips=ends).reset().exclude("episode_stream")
+        assert_same(first.select(*expected.keys()), expected)
+        assert (first["episode_stream"] != second["episode_stream"]).all()
+    with pytest.raises(ValueError, match=r"must be in the region and its margin, got .*78\.0"):
+        make(2).reset(own.set("position", ends.start + 80.0), set_state=True)
+
+
 def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
     mask = torch.tensor([True, False, True])
     for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms
@@ -282,7 +308,7 @@ def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
         assert (env.reset(TensorDict(_reset=torch.ones_like(mask), batch_size=[3]))["elapsed_steps"] == 0).all()
     batch = SerialEnv(2, lambda: make(3))
     td = batch.step_mdp(batch.rand_step(batch.reset()))
-    after = batch.reset(td.set("_reset", torch.stack((mask, ~mask)).unsqueeze(-1)))
+    after = batch.reset(td.set("_reset", torch.stack((mask, ~mask)).unsqueeze(-1)), set_state=False)
     assert after["elapsed_steps"].flatten().tolist() == [0, 1, 0, 1, 0, 1]
 
 
@@ -345,9 +371,9 @@ def test_vehicles_fly_frozen_trips_in_turn_and_count_their_own_episodes() -> Non
     assert [started(env.reset()) for _ in range(4)] == [[0, 1], [2, 3], [4, 0], [1, 2]]
     td = again.reset()
     for expected in ([0, 3], [0, 0], [0, 2]):
-        td = again.reset(td.set("_reset", torch.tensor([[False], [True]])))
+        td = again.reset(td.set("_reset", torch.tensor([[False], [True]])), set_state=False)
         assert started(td) == expected
-    again.reset(td.set("_reset", torch.tensor([[False], [False]])))
+    again.reset(td.set("_reset", torch.tensor([[False], [False]])), set_state=False)
     assert started(again.reset()) == [2, 4]
 
 

@@ -81,7 +81,9 @@ def states_of(env: EnvBase, policy: TensorDictModuleBase, steps: int = 4) -> lis
         states.append(policy(state))
         state = step_mdp(env.step(states[-1].clone()))
         if step == 1:
-            state = env.reset(state.set("_reset", torch.tensor([[True], [False], [False], [True], [False]])))
+            state = env.reset(
+                state.set("_reset", torch.tensor([[True], [False], [False], [True], [False]])), set_state=False
+            )
     return states
 
 

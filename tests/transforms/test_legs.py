@@ -89,7 +89,7 @@ def test_the_set_of_a_current_is_seen_from_the_heading(heading: float) -> None:
 def test_an_episode_begins_without_legs_and_the_others_keep_theirs() -> None:
     env = eddies_env(4, seed=0)
     state = env.rollout(3, break_when_any_done=False)["next"][:, -1]
-    again = env.reset(state.clone().set("_reset", torch.tensor([[True], [False], [False], [True]])))
+    again = env.reset(state.clone().set("_reset", torch.tensor([[True], [False], [False], [True]])), set_state=False)
     assert (again["recent_legs"][[0, 3], 5:] == 0).all()
     assert_close(again["recent_legs"][1:3], state["recent_legs"][1:3])
     assert (again["legs"][1:3, :3, -1] == 1).all()
