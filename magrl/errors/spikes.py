@@ -54,6 +54,6 @@ class Spikes(ReadingErrors):
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         uniform = stream_uniform(episode.stream, self.step_draws)
         normal = normal_of(uniform[..., :-1]).to(episode.numbers)
-        spike = torch.where(uniform[..., -1:] < self.rate, normal * self._sizes, 0.0)
+        spike = torch.where(uniform[..., -1:] < self.rate, normal * self._sizes.to(normal), 0.0)
         self._measure(tensordict, values[0], values[0] + spike)
         return spike

@@ -258,7 +258,7 @@ def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, t
     goal, local, dtype = _goal(rules, state, reading), elements(state.belief), reading.target.dtype
     points = posterior(goal)
     displacement = points.displacement()
-    aim = displacement.mean
+    aim = displacement.mean.to(dtype)
     if rules.signaled and rules.target_km is None:
         radius = rules.radius_km if rules.arrival == "distance" else None
         ellipse = arrival_ellipse(local.gradient, local.covariance[..., 1:, 1:], state.weights.double(), radius)

@@ -262,6 +262,11 @@ class StepReward(StatefulTransform):
 
     default_out_keys = ("reward",)
 
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        key = self.out_keys[0]
+        before, after = next_tensordict.get(key, None), super()._step(tensordict, next_tensordict)
+        return after if before is None else after.set(key, after[key].to(before.dtype))
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         for key in self.out_keys[1:]:
             tensordict_reset.set(key, torch.zeros_like(tensordict_reset[self.in_keys[0]][..., :1]))

@@ -35,9 +35,16 @@ LEAST |= {"fix": (3.0, 160.0), "target_fix": (6.0, 163.0)}
 class Foreign(EnvBase):
     """An environment of any batch with any keys, whose values depend on the number of the step alone."""
 
-    def __init__(self, batch: tuple[int, ...], names: list[str], key: Callable[[str], NestedKey], actions: int) -> None:
+    def __init__(
+        self,
+        batch: tuple[int, ...],
+        names: list[str],
+        key: Callable[[str], NestedKey],
+        actions: int,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
         super().__init__(batch_size=torch.Size(batch))
-        self.names, self.key, self.count = names, key, 0
+        self.names, self.key, self.count, self.dtype = names, key, 0, dtype
         self.observation_spec = Composite(leg_error=Bounded(-99.0, 99.0, (*batch, 2), dtype=torch.float64), shape=batch)
         for name, value in self._values().items():
             if key(name) not in FLAGS:
@@ -54,7 +61,7 @@ class Foreign(EnvBase):
         draw, values = torch.Generator().manual_seed(self.count), {}
         for name in self.names:
             value = torch.rand(*self.batch_size, SIZES[name], generator=draw) + torch.tensor(LEAST.get(name, 0.0))
-            values[name] = value.to(torch.float64 if "position" in name or "fix" in name else torch.float32)
+            values[name] = value.to(torch.float64 if "position" in name or "fix" in name else self.dtype)
         flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("success", *FLAGS)}
         values |= {name: flag for name, flag in flags.items() if name in self.names}
         if "elapsed_steps" in values:
@@ -84,7 +91,7 @@ def waves(position: Tensor) -> Tensor:
 
 
 STD, RULES = (0.1, 0.1, 10.0), Rules(arrival="declared")
-PUBLIC = [kind for kind in vars(transforms).values() if isinstance(kind, type)]
+PUBLIC = [kind for kind in (vars(transforms) | vars(errors)).values() if isinstance(kind, type)]
 KINDS = [kind for kind in PUBLIC if issubclass(kind, Transform)]
 OPTIONS: dict[type[Transform], dict] = {
     transforms.DistanceCost: {"cost": 0.1},
@@ -154,6 +161,26 @@ def test_every_key_may_be_renamed_in_a_foreign_environment(kind: type[Transform]
     plain, renamed = (flight(kind, batch, key) for key in (str, other))
     assert_close(plain, renamed, rtol=0, atol=0, equal_nan=True)
     assert plain[-1] or kind is DeclareArrival
+
+
+# Types
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_values_keep_their_type_whatever_the_default_is(kind: type[Transform], dtype: torch.dtype) -> None:
+    ins, outs = keys_of(kind)
+    for default in (torch.float32, torch.float64):
+        torch.set_default_dtype(default)
+        try:
+            foreign = Foreign((2,), ins, str, 3 if kind is DeclareArrival else 2, dtype)
+            env = TransformedEnv(foreign, make(kind, ins, outs))
+            check_env_specs(env)
+            state = env.rollout(2)["next"]
+        finally:
+            torch.set_default_dtype(torch.float32)
+        for name, spec in foreign.observation_spec.items():
+            assert state[name].dtype == spec.dtype, name
 
 
 # Data
