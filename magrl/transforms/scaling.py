@@ -162,6 +162,12 @@ class MinMaxNorm(ObservationTransform):
         return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        lost = [key for key in self.in_keys_inv if key not in self.in_keys]
+        if lost and self.container is None:
+            raise ValueError(
+                f"MinMaxNorm outside of an environment, as in a replay buffer, would store {lost} in units that no "
+                "sample is scaled from: name them in in_keys, too; data of an environment with MinMaxNorm are scaled"
+            )
         for key, scaled in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             tensordict.set(key, self.denormalize(key, *self._read(tensordict, [scaled])))
         return tensordict
