@@ -235,7 +235,7 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
             env.append_transform(RenameTransform(["observation"], parts))
         env.append_transform(CatTensors([*parts, "areas"], "observation", del_keys=False, sort=False))
     if options.get("observation", "flat") == "flat":
-        env.view = replace(env.view, observe_areas=True)
+        env.base_env.view = replace(env.view, observe_areas=True)
     return env
 
 

@@ -101,6 +101,7 @@ class GeomagneticNavEnv(EnvBase):
     vehicle: Tensor
     episode: Tensor
     field: Any  # a field model, or a bank of them
+    view: Any  # what an agent observes; :func:`magrl.envs.navigation.navigation_env` writes it
 
     def __init__(
         self,

@@ -136,8 +136,8 @@ def _observation(env: TransformedEnv, observation: str | Sequence[str], **switch
             raise ValueError(f"{message}: take observation='track', or 'dict' for raw readings")
         limits = {"max_leg_km": base.max_leg_km, "max_turn_rad": base.max_turn_rad}
         legs = LegsView(max_steps=base.max_steps, **limits) if observation == "legs" else None
-        env.view = legs or base.observation_view(**switches)
-        return [*env.view.needed(env), *env.view.observation_transforms()]
+        base.view = legs or base.observation_view(**switches)  # TorchRL forwards attributes of the plain environment
+        return [*base.view.needed(env), *base.view.observation_transforms()]
     if observation == "track":
         return [TrackField(Rules(**base.limits), known_keys(env.observation_spec))]
     if observation == "readings":

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import td3_gradient_guided as recipe
@@ -9,13 +10,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs import CatTensors, Compose, Transform, TransformedEnv
+from torchrl.envs import CatTensors, Compose, StepCounter, Transform, TransformedEnv
 
 from magrl.envs import PAPER_REGION, Region, Scenario
 from magrl.envs.navigation import navigation_env
 from magrl.errors import NorthReferenceError, SensorErrors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
+from magrl.named_tasks import no_go_env
 from magrl.navigators import Geodesic
 from magrl.pilot import Rules
 from magrl.transforms import DeclareArrival, GradientHeading, TrackField
@@ -107,3 +109,11 @@ def test_actions_are_scaled_to_the_bounds_that_transforms_leave() -> None:
         assert (env.action_spec.space.high == 1).all()
         state = env.reset().set("action", torch.tensor([[1.0, 0.5]]).expand(2, 2))
         assert env.step(state)["next", "leg"][0].tolist() == pytest.approx([50, math.pi / 4])
+
+
+@pytest.mark.parametrize("make", [navigation_env, partial(navigation_env, observation="legs"), no_go_env])
+def test_the_view_is_there_behind_further_transforms(make: Callable[..., TransformedEnv]) -> None:
+    env = make(2, seed=0)
+    outer = TransformedEnv(env, StepCounter(), auto_unwrap=True)
+    assert outer.view == env.view
+    assert outer.view.size == outer.observation_spec["observation"].shape[-1]
