@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 
 import pytest
@@ -20,8 +21,8 @@ def temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 @pytest.fixture(scope="session", autouse=True)
 def one_onnx_registry() -> Iterator[None]:
     """Register the operators of ONNX once, not in each export, where this takes half of the time."""
-    from torch.onnx._internal.exporter._registration import ONNXRegistry
+    with pytest.MonkeyPatch.context() as patch, suppress(ImportError, AttributeError):  # private: without it, all is slow
+        from torch.onnx._internal.exporter._registration import ONNXRegistry
 
-    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib)))
         yield
