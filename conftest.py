@@ -21,7 +21,10 @@ def temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 @pytest.fixture(scope="session", autouse=True)
 def one_onnx_registry() -> Iterator[None]:
     """Register the operators of ONNX once, not in each export, where this takes half of the time."""
-    with pytest.MonkeyPatch.context() as patch, suppress(ImportError, AttributeError):  # private: without it, all is slow
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        suppress(ImportError, AttributeError),
+    ):  # private
         from torch.onnx._internal.exporter._registration import ONNXRegistry
 
         patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib)))

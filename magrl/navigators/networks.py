@@ -16,6 +16,7 @@ from magrl.pilot import Rules
 from magrl.pilot.planning import corrected
 from magrl.pilot.step import moving
 from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM
+from magrl.transforms.views import ObservationView
 
 Device = torch.device | str | None
 MOST_LAYERS = 64
@@ -59,25 +60,33 @@ def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm:
 class AreaGeometry(nn.Module):
     """A fixed first layer for observations with no-go areas (:class:`~magrl.transforms.NoGoAreas`), without weights.
 
-    It adds the differences to the destination in the frame of the heading, and of each area in sight the direction, the
-    distance of the center, and the bearings of the center and of both edges; with an action, also by how much the leg
-    clears each of them. A perceptron learns such products and angles slowly, and the edges decide about a collision.
+    It adds the differences to the destination in the frame of the heading, if both are observed, and of each area in
+    sight the direction, the distance of the center, and the bearings of the center and of both edges; with an action,
+    also by how much the leg clears each of them. A perceptron learns such products and angles slowly, and the edges
+    decide about a collision.
 
-    The input is the observation ``(..., 22)`` of :class:`~magrl.transforms.ObservationView`, perhaps with an action
-    ``(..., 2)`` in [-1, 1] for the limits of the named task: 50 km, 90 degrees.
+    The input is an observation with areas, perhaps with an action ``(..., 2)`` in [-1, 1].
+
+    Args:
+        view: columns of the observation and limits of the action.
 
     Example:
-        >>> AreaGeometry()(torch.zeros(5, 22)).shape, AreaGeometry()(torch.zeros(5, 24)).shape
+        >>> from magrl.named_tasks import no_go_env
+        >>> geometry = AreaGeometry(no_go_env(seed=0).view)
+        >>> geometry(torch.zeros(5, 22)).shape, geometry(torch.zeros(5, 24)).shape
         (torch.Size([5, 46]), torch.Size([5, 54]))
     """
 
-    SIZE = 22
     UNIT_KM, CLEAR_KM = 100.0, 20.0
+
+    def __init__(self, view: ObservationView) -> None:
+        super().__init__()
+        self.view = view
 
     def forward(self, observed: Tensor) -> Tensor:
         """Return the input with its features."""
-        seen, action = observed.tensor_split([self.SIZE], -1)
-        difference, heading, areas = seen[..., 8:11], seen[..., 11:13], seen[..., 13:].unflatten(-1, (SEEN, 3))
+        columns, (seen, action) = self.view.columns, observed.tensor_split([self.view.size], -1)
+        areas = seen[..., columns["areas"]].unflatten(-1, (SEEN, 3))
         ahead, right, size = areas.unbind(-1)
         there, near = size > 0, torch.sqrt(ahead.square() + right.square() + 1e-12)
         radius = RADIUS_KM[1] * size
@@ -87,32 +96,40 @@ class AreaGeometry(nn.Module):
         edges = torch.stack((half, bearing - half, bearing + half), -1) * (2 / math.pi)
         unit = areas[..., :2] / near.clamp_min(1e-4).unsqueeze(-1)
         about = torch.cat((unit, center.unsqueeze(-1) / self.UNIT_KM, edges), -1) * there.unsqueeze(-1)
-        turned = difference.unsqueeze(-1) * heading.unsqueeze(-2)
-        parts = seen, turned.flatten(-2), about.flatten(-2)
+        parts = [seen, about.flatten(-2)]
+        if {"difference", "heading"} <= columns.keys():
+            turned = seen[..., columns["difference"]].unsqueeze(-1) * seen[..., columns["heading"]].unsqueeze(-2)
+            parts.insert(1, turned.flatten(-2))
         if not action.shape[-1]:
             return torch.cat(parts, -1)
         clear_km = self._clear_km(action, center, bearing) - radius
         clear = (clear_km / self.CLEAR_KM).clamp(-1.5, 3.0).where(there, 3.0)
         return torch.cat((*parts, action, clear, torch.sigmoid(clear_km / 2).where(there, 1.0)), -1)
 
-    @staticmethod
-    def _clear_km(action: Tensor, center: Tensor, bearing: Tensor) -> Tensor:
+    def _clear_km(self, action: Tensor, center: Tensor, bearing: Tensor) -> Tensor:
         """Return the least distance of a leg from centers ``(..., 3)`` [km]."""
-        leg, away = 25 * (action[..., :1] + 1), bearing - action[..., 1:] * (math.pi / 2)
+        leg = self.view.max_leg_km / 2 * (action[..., :1] + 1)
+        away = bearing - action[..., 1:] * self.view.max_turn_rad
         along, across = center * torch.cos(away), center * torch.sin(away)
         return torch.hypot(along - torch.minimum(along.clamp_min(0), leg), across)
 
 
 def make_network(
-    inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm: bool, geometry: bool, device: Device = None
+    inputs: int,
+    outputs: int,
+    num_cells: Sequence[int],
+    *,
+    layer_norm: bool,
+    geometry: ObservationView | None = None,
+    device: Device = None,
 ) -> nn.Sequential:
     """Return a perceptron, perhaps behind :class:`AreaGeometry`; other arguments as of :func:`make_mlp`.
 
     Example:
-        >>> make_network(24, 1, (8,), layer_norm=True, geometry=True)(torch.zeros(5, 24)).shape
+        >>> make_network(24, 1, (8,), layer_norm=True)(torch.zeros(5, 24)).shape
         torch.Size([5, 1])
     """
-    first = [AreaGeometry()] if geometry else []
+    first = [] if geometry is None else [AreaGeometry(geometry)]
     size = nn.Sequential(*first)(torch.zeros(inputs)).shape[-1]
     network = make_mlp(size, outputs, num_cells, layer_norm=layer_norm, device=device)
     return nn.Sequential(*first, *network) if geometry else network
@@ -123,7 +140,7 @@ def make_actor(
     num_cells: Sequence[int],
     *,
     layer_norm: bool = True,
-    geometry: bool = False,
+    geometry: ObservationView | None = None,
     device: Device = None,
 ) -> TensorDictSequential:
     """Return a deterministic actor: ``observation`` ``(..., K)`` to ``logits`` and ``action`` ``(..., 2)``.
@@ -134,7 +151,7 @@ def make_actor(
         observation_size: number of entries K of the observation.
         num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
-        geometry: whether the first layer is :class:`AreaGeometry`.
+        geometry: view of the observation that :class:`AreaGeometry` reads as the first layer, or None.
         device: device of the parameters.
 
     Raises:
@@ -241,7 +258,7 @@ def make_critic(
     num_cells: Sequence[int],
     *,
     layer_norm: bool = True,
-    geometry: bool = False,
+    geometry: ObservationView | None = None,
     device: Device = None,
 ) -> ValueOperator:
     """Return a critic: ``observation`` ``(..., K)`` and ``action`` ``(..., 2)`` to ``state_action_value`` ``(..., 1)``.
@@ -250,7 +267,7 @@ def make_critic(
         observation_size: number of entries K of the observation.
         num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
-        geometry: whether the first layer is :class:`AreaGeometry`.
+        geometry: view of the observation that :class:`AreaGeometry` reads as the first layer, or None.
         device: device of the parameters.
 
     Raises:

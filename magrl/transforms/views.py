@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -107,9 +108,9 @@ class _View:
     max_turn_rad: float
 
     @property
-    def geometry(self) -> bool:
-        """Whether :class:`~magrl.navigators.networks.AreaGeometry` reads the observation."""
-        return False
+    def geometry(self) -> ObservationView | None:
+        """The view, if :class:`~magrl.navigators.networks.AreaGeometry` reads the observation."""
+        return None
 
     def __post_init__(self) -> None:
         check_number(0, above=True, max_leg_km=self.max_leg_km)
@@ -183,12 +184,20 @@ class ObservationView(_View):
     @property
     def size(self) -> int:
         """Number of entries of ``observation``."""
-        return 8 + 3 * self.observe_difference + 2 * self.observe_heading + 3 * SEEN * self.observe_areas
+        return list(self.columns.values())[-1].stop
 
     @property
-    def geometry(self) -> bool:
-        """Whether :class:`~magrl.navigators.networks.AreaGeometry` reads the observation: areas, and all else."""
-        return self.observe_areas and self.observe_heading and self.observe_difference
+    def columns(self) -> dict[str, slice]:
+        """Entries of ``observation`` by name, in their order."""
+        sizes = {"field": 3, "target_field": 3, "leg": 2, "difference": 3 * self.observe_difference}
+        sizes |= {"heading": 2 * self.observe_heading, "areas": 3 * SEEN * self.observe_areas}
+        ends = accumulate(sizes.values())
+        return {key: slice(end - size, end) for (key, size), end in zip(sizes.items(), ends, strict=True) if size}
+
+    @property
+    def geometry(self) -> ObservationView | None:
+        """The view, if it has areas, which :class:`~magrl.navigators.networks.AreaGeometry` reads."""
+        return self if self.observe_areas else None
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys to ``observation`` ``(..., size)``."""

@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from magrl.named_tasks import no_go_env
 from magrl.navigators import make_actor
 from magrl.navigators.networks import AreaGeometry, CorrectedLeg
 from magrl.pilot import Rules
@@ -38,25 +39,30 @@ def test_bad_sizes_are_refused() -> None:
             make_actor(size, cells)
 
 
-def test_the_geometry_of_areas_is_that_of_their_discs() -> None:
+@pytest.mark.parametrize("without", [(), ("observe_difference",), ("observe_difference", "observe_heading")], ids=str)
+@pytest.mark.parametrize("max_leg_km", [50.0, 30.0])
+def test_the_geometry_of_areas_is_that_of_their_discs(max_leg_km: float, without: tuple[str, ...]) -> None:
     """Bearings of center and edges, and by how much a leg clears each disc, from the observation alone."""
     generator = torch.Generator().manual_seed(0)
     centers = 60 + 100 * torch.rand(50, 4, 2, generator=generator)
     radii = 15 + 25 * torch.rand(50, 4, generator=generator)
     seen = NoGoAreas()._seen(centers, radii, torch.zeros(50, 1))
     action = 2 * torch.rand(50, 2, generator=generator) - 1
-    features = AreaGeometry()(torch.cat((torch.zeros(50, 13), seen, action), -1))
+    env = no_go_env(seed=0, max_leg_km=max_leg_km, max_turn_deg=60.0, **dict.fromkeys(without, False))
+    before = torch.zeros(50, env.view.size - 9)
+    features = AreaGeometry(env.view.geometry)(torch.cat((before, seen, action), -1))
+    about, _, clear_by, _ = features[:, -26:].split((18, 2, 3, 3), -1)
     order = (centers.norm(dim=-1) - radii).argsort(-1)[:, :3]
     center, radius = centers.take_along_dim(order.unsqueeze(-1), -2), radii.gather(-1, order)
     there = seen.unflatten(-1, (3, 3))[..., 2] > 0
     bearing, half = torch.atan2(center[..., 1], center[..., 0]), torch.asin(radius / center.norm(dim=-1))
     expected = torch.stack((half, bearing - half, bearing + half), -1) / (math.pi / 2)
-    about = features[:, 28:46].unflatten(-1, (3, 6))
+    about = about.unflatten(-1, (3, 6))
     torch.testing.assert_close(about[there][:, 3:], expected[there], atol=1e-4, rtol=0)
     assert (about[~there] == 0).all()
-    turn, length = action[:, 1:] * math.pi / 2, 25 * (action[:, :1] + 1)
+    turn, length = action[:, 1:] * math.pi / 3, max_leg_km / 2 * (action[:, :1] + 1)
     end = length * torch.cat((torch.cos(turn), torch.sin(turn)), -1)
     clear = (distance_km(center, torch.zeros(50, 2), end) - radius) / 20
-    torch.testing.assert_close(features[:, 48:51][there], clear.clamp(-1.5, 3)[there], atol=1e-3, rtol=0)
-    assert (features[:, 48:51][~there] == 3).all()
+    torch.testing.assert_close(clear_by[there], clear.clamp(-1.5, 3)[there], atol=1e-3, rtol=0)
+    assert (clear_by[~there] == 3).all()
     assert 0 < there.sum() < 150
