@@ -208,8 +208,8 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
     action = action.double()
     slack = 1e-5 * (high - low)
     sound = (action >= low - slack) & (action <= high + slack)
-    if torch.compiler.is_compiling() or action.is_cuda:
-        torch._assert_async(sound.all(), "GeomagneticNavEnv: an action is not finite or out of bounds")
+    if torch.compiler.is_compiling() or action.device.type != "cpu":
+        require(sound, action, "GeomagneticNavEnv: an action is not finite or out of bounds")
     elif not sound.all():
         bad = (~sound.all(-1)).nonzero().squeeze(-1)[:8]
         scaled = (2 * (action[bad] - low) / (high - low) - 1).double().round(decimals=6)

@@ -6,6 +6,7 @@ import ast
 import re
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 
@@ -48,6 +49,11 @@ def top(module: str) -> str:
     return module.split(".")[1]
 
 
+PRIVATE = {
+    "torch._assert_async": {"magrl.checks"},
+    "torch.utils._pytree": {"magrl.evaluation.arrays", "magrl.evaluation.scores"},
+    "torch.utils._python_dispatch": {"magrl.pilot.harmonics"},
+}
 MODULES = [name for name in sources() if name != "magrl"]
 
 
@@ -89,6 +95,20 @@ ADDITIONS = (
     "a measure",
     "a kind of policy file",
 )
+
+
+def test_private_names_of_torch_stand_in_known_modules() -> None:
+    """Beside those of TorchRL's collector, in test_checkpoints.py, and ``_step``, which environments define."""
+    pattern, found = re.compile(r"\b(?:torch|torchrl|tensordict)\b[\w.]*\._[a-z]\w*"), {}
+    for module, tree in sources().items():
+        for name in pattern.findall(ast.unparse(tree)):
+            found.setdefault(name, set()).add(module)
+    assert found == PRIVATE
+    for name, modules in found.items():
+        try:
+            resolve_name(name)
+        except (AttributeError, ImportError) as error:
+            raise AssertionError(f"{name} is gone: adapt {sorted(modules)}") from error
 
 
 def test_an_addition_touches_at_most_two_files_and_a_page() -> None:
