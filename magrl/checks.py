@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable
+from importlib import import_module
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Self
 
@@ -85,6 +86,22 @@ def require(good: Tensor, values: Tensor, message: str) -> None:
         torch._assert_async(good.all(), message)
     elif not good.all():
         raise ValueError(message.format(values[~good].flatten()[0].item()))
+
+
+def library(name: str, extra: str) -> Any:
+    """Return a library that an extra of this package installs.
+
+    Raises:
+        ImportError: without it, with the command that installs it.
+
+    Example:
+        >>> library("math", "plots").pi > 3
+        True
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ImportError(f"this needs the package {name.partition('.')[0]}: pip install 'magrl[{extra}]'") from error
 
 
 def check_tensor(*last: int, **tensors: object) -> None:

@@ -279,7 +279,7 @@ class GeomagneticNavEnv(EnvBase):
         ends = torch.stack((state["position"], state["target_position"])).double()
         if not self.edge.contains(ends, region).all():
             raise ValueError(f"position and target_position must be in the region and its margin, got {ends.tolist()}")
-        start = self._start_of(torch.arange(self.num_envs, device=self.device), Trips(*ends, region))
+        start = self._start_of(torch.arange(self.num_envs, device=self.device), Trips(ends[0], ends[1], region))
         for key in (given | {"leg"} & set(state.keys())) - places - {"target_field"}:
             start[key] = state[key].to(start[key])
         return start

@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number
+from magrl.checks import check_number, library
 from magrl.envs.regions import Region, Regions, one_region
 from magrl.field.elements import NAMES, UNITS
 from magrl.field.model import FieldModel, device_of, elements_at
@@ -47,12 +47,10 @@ def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray
         >>> rgb_array(lambda axes, x: axes.plot(x), 100, [1, 3, 2]).shape
         (100, 100, 3)
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     check_number(1, whole=True, size_px=size_px)
-    figure = Figure(figsize=(7, 7), dpi=(size_px + 0.01) / 7, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    kind = library("matplotlib.figure", "plots").Figure
+    figure = kind(figsize=(7, 7), dpi=(size_px + 0.01) / 7, layout="constrained")
+    canvas = library("matplotlib.backends.backend_agg", "plots").FigureCanvasAgg(figure)
     draw(figure.subplots(), *args)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -12,21 +12,24 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number
+from magrl.checks import check_number, library
 from magrl.envs import Region, Regions
 from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
 from magrl.evaluation.episodes import episode_measures
 from magrl.field import FieldModel
 from magrl.geodesy import geodesic, move, polar
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LAND, ESTIMATE = "#8c6d46", "#56B4E9"
 """Colors of coastlines, and of estimates of the destination."""
@@ -153,7 +156,7 @@ def trajectories_figure(
     if not titled:
         raise ValueError("rollouts must hold the episodes of at least one navigator, got {}")
     columns, rows = min(len(titled), 3), math.ceil(len(titled) / 3)
-    figure = Figure(layout="constrained")
+    figure = library("matplotlib.figure", "plots").Figure(layout="constrained")
     for place, (title, rollout) in enumerate(titled.items(), 1):
         axes, shown = figure.add_subplot(rows, columns, place, title=title), rollout[:episodes].cpu()
         tracks, height = _draw_map(axes, shown, field, region)

@@ -6,7 +6,6 @@ import json
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
-from importlib import import_module
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase, set_interaction_type
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from magrl.checks import short
+from magrl.checks import library, short
 
 DESCRIPTION = "magrl"
 """Entry of the metadata of a file that describes its policy, as JSON."""
@@ -66,7 +65,7 @@ class OnnxNetwork(nn.Module):
 
 def with_description(content: bytes, description: Mapping[str, Any]) -> bytes:
     """Return an ONNX file whose metadata describe its policy, without PyTorch's metadata on where it was exported."""
-    onnx = _library("onnx")
+    onnx = library("onnx", "onnx")
     model = onnx.load_model_from_string(content)
     for part in (model.graph, *model.functions):
         _strip(part)
@@ -115,7 +114,7 @@ def exported(actor: nn.Module, size: int) -> OnnxNetwork:
         ImportError: without the extra ``onnx``.
         ValueError: for a network that PyTorch cannot export, or whose export acts differently.
     """
-    _library("onnxscript")
+    library("onnxscript", "onnx")
     draw = torch.Generator().manual_seed(0)
     observation = 2 * torch.rand(_CHECKED, size, generator=draw, dtype=torch.float32) - 1
     modes, validated = {part: part.training for part in actor.modules()}, Distribution._validate_args
@@ -181,14 +180,7 @@ def _check_input(found: Any, size: int) -> None:
 @lru_cache(maxsize=8)
 def _session(content: bytes) -> Any:
     """Return the session of a file; outside of the modules, which are copied."""
-    runtime = _library("onnxruntime")
+    runtime = library("onnxruntime", "onnx")
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = torch.get_num_threads(), 4
     return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-
-
-def _library(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ImportError(f"policies as ONNX need the package {name}: pip install 'magrl[onnx]'") from error

@@ -72,8 +72,8 @@ class PolicyConfig:
             raise ValueError(
                 f"num_cells must be the widths of the hidden layers with {type(self.view).__name__}, got None"
             )
-        shape = {"layer_norm": self.layer_norm, "geometry": self.view.geometry}
-        return make_actor(self.view.size, self.num_cells, **shape, device=device)
+        norm, geometry = self.layer_norm, self.view.geometry
+        return make_actor(self.view.size, self.num_cells, layer_norm=norm, geometry=geometry, device=device)
 
 
 class TrainingSettings(rule_settings("zeta", "start_heading")):  # type: ignore[misc]

@@ -8,10 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-import tyro
 from pydantic import AfterValidator, Field, model_validator
 
-from magrl.checks import CheckedModel, check_choice, check_device
+from magrl.checks import CheckedModel, check_choice, check_device, library
 from magrl.commands import UsageError
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import RULES, rule_settings
@@ -316,7 +315,7 @@ def parse(
         (0.05, 0.05, 5.0)
     """
     words = [part for word in (sys.argv[1:] if args is None else args) for part in _tyro_words(word)]
-    return tyro.cli(kind, args=words, prog=recipe, description=description, **options)
+    return library("tyro", "recipes").cli(kind, args=words, prog=recipe, description=description, **options)
 
 
 def _tyro_words(word: str) -> list[str]:

@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from magrl.checks import library
 from magrl.files import append, write_json, write_text, write_with
 from magrl.training.wandb_run import WandbRun
 
@@ -253,10 +254,7 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
         >>> [axes.get_title() for axes in training_figure(rows).axes]
         ['return', 'return by term', 'success [%]', 'loss']
     """
-    from matplotlib.figure import Figure  # slow to import
-    from matplotlib.ticker import EngFormatter
-
-    figure = Figure(figsize=(10, 7), layout="constrained")
+    figure = library("matplotlib.figure", "plots").Figure(figsize=(10, 7), layout="constrained")
     frames = np.array([row["frames"] for row in rows])
     for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
         for color, (column, label) in zip(LINES, columns.items(), strict=False):
@@ -269,5 +267,5 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
             axes.legend(fontsize=8)
     for axes in figure.axes[2:]:
         axes.set_xlabel("frames (vehicle-steps)")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_major_formatter(library("matplotlib.ticker", "plots").EngFormatter(sep=""))
     return figure

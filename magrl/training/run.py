@@ -23,9 +23,8 @@ from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
-from magrl.checks import check_finite, short
+from magrl.checks import check_finite, library, short
 from magrl.commands import UsageError
 from magrl.envs import GeomagneticNavEnv, Scenario, Trips
 from magrl.envs.measures import summarize
@@ -275,6 +274,7 @@ class Run:
         saved = time.perf_counter()
         counted = "episodes" if self.config.total_episodes else "frames"
         bar = {"total": getattr(self.config, f"total_{counted}"), "initial": getattr(self.statistics, counted)}
+        tqdm = library("tqdm", "recipes").tqdm
         with tqdm(**bar, unit=counted[:-1], desc=self.name, mininterval=0.5, unit_scale=True) as progress:
             for batch in self.collector:
                 check_finite(batch.exclude("track", ("next", "track")), f"after {self.statistics.frames} frames")

@@ -111,6 +111,13 @@ def test_private_names_of_torch_stand_in_known_modules() -> None:
             raise AssertionError(f"{name} is gone: adapt {sorted(modules)}") from error
 
 
+def test_what_an_extra_installs_is_imported_when_it_is_used() -> None:
+    """By :func:`magrl.checks.library`, which names the extra; modules of magrl import without."""
+    extras = re.compile(r"^ *(?:import|from) (?:matplotlib|PIL|tqdm|tyro|onnx\w*|minari|h5py)\b", re.MULTILINE)
+    for module, tree in sources().items():
+        assert not extras.search(re.sub(r"if TYPE_CHECKING:\n(    .*\n)+", "", ast.unparse(tree) + "\n")), module
+
+
 def test_an_addition_touches_at_most_two_files_and_a_page() -> None:
     """All of which exist; a new file, NAME, stands in a folder that does."""
     table = PAGE.partition("| to add | touch | page |\n")[2].partition("\n\n")[0]
