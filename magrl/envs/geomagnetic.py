@@ -272,13 +272,12 @@ class GeomagneticNavEnv(EnvBase):
         keys, places, first = set(self.state_spec.keys()), {"position", "target_position"}, {"heading", "region"}
         given = keys & set(state.keys())
         if missing := sorted((places if given <= places | first else keys) - given):
-            raise KeyError(
-                f"a state lacks {missing}: give all of {sorted(keys)}, or {sorted(places)} alone, for a start"
-            )
+            raise KeyError(f"a state lacks {missing}: give all of {sorted(keys)}, or {sorted(places)} alone")
         region = state.get("region", torch.zeros_like(self.vehicle)).reshape(self.num_envs)
         ends = torch.stack((state["position"], state["target_position"])).double()
         if not self.edge.contains(ends, region).all():
             raise ValueError(f"position and target_position must be in the region and its margin, got {ends.tolist()}")
+        self._tracks = TrackRecorder(self.max_steps + 1 if self.render_mode else 0)  # what came before is not known
         start = self._start_of(torch.arange(self.num_envs, device=self.device), Trips(ends[0], ends[1], region))
         for key in (given | {"leg"} & set(state.keys())) - places - {"target_field"}:
             start[key] = state[key].to(start[key])

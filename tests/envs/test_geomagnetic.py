@@ -277,10 +277,12 @@ def test_starts_computed_ahead_do_not_change_with_what_a_reset_returned_or_a_sta
 @pytest.mark.parametrize("options", [{}, {"drift_km": 20.0, "start_heading": "random", "max_turn_deg": 180.0}])
 def test_a_reset_to_a_state_goes_on_from_there(options: dict[str, Any]) -> None:
     """In an environment of another seed, too."""
-    env, other = make(3, **options), make(3, **options | {"seed": 7})
+    env, other = make(3, **options), make(3, **options | {"seed": 7, "render_mode": "rgb_array"})
+    other.rollout(3)
     state, action = env.step_mdp(env.rand_step(env.reset())), random_actions(1, 3)[0]
     again = other.reset(state.clone(), set_state=True)
     assert_same(again.select(*state.keys()), state, but=REWARD_TERMS)
+    assert torch.equal(other.track(1), state["position"][1:2])
     assert_same(*(each.step(td.set("action", action))["next"] for each, td in ((env, state), (other, again))))
     with pytest.raises(KeyError, match=r"lacks \[.*'objective_weights'.*'position', 'target_position'\] alone"):
         env.reset(state.exclude("objective_weights"), set_state=True)
