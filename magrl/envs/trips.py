@@ -261,11 +261,11 @@ def check_trips(trips: Trips, within: Regions) -> Trips:
                 f"{within[int(region[number])]}"
             )
     distance_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
-    if (distance_km < SHORTEST_KM).any():
-        number = int((distance_km < SHORTEST_KM).nonzero()[0])
+    if (wrong := ~(distance_km >= SHORTEST_KM)).any():  # NaN at the antipode
+        number = int(wrong.nonzero()[0])
         raise ValueError(
-            f"trip {number} (the first is trip 0) starts at its destination, {start[number].tolist()}: move one of "
-            "them, or remove the trip"
+            f"trip {number} (the first is trip 0) starts at its destination or nearly its antipode, "
+            f"{start[number].tolist()}: move one of them, or remove the trip"
         )
     start, target = (torch.stack((x[:, 0], wrap_longitude(x[:, 1])), -1) for x in (start, target))
     return Trips(start, target, region)

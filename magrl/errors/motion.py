@@ -182,7 +182,7 @@ class MotionError(EpisodeErrors):
         spec = observed_spec(self).get(LEG_ERROR, None)
         allowed = 0.0 if spec is None else float(spec.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded
-        if spec is None or drift > allowed + 1e-6 * commanded:
+        if spec is None or not drift <= allowed + 1e-6 * commanded:
             raise ValueError(
                 f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment allows "
                 f"{allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"

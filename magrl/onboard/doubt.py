@@ -49,7 +49,7 @@ class Doubt(NamedTuple):
     @property
     def lost(self) -> bool:
         """Whether the readings contradict each other."""
-        return len(self.surprises) >= _LEAST and self.level > LOST_SURPRISE
+        return len(self.surprises) >= _LEAST and not self.level <= LOST_SURPRISE
 
     @property
     def contradiction(self) -> str:

@@ -33,6 +33,16 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
+def finite(values: Any) -> bool:
+    """Return whether all numbers of a record of numbers, texts and tuples of them are finite.
+
+    Example:
+        >>> finite(("lost", 1.0, (0.0, math.nan)))
+        False
+    """
+    return all(finite(x) if isinstance(x, tuple) else not isinstance(x, float) or math.isfinite(x) for x in values)
+
+
 class Inputs(CheckedModel):
     """Take numbers of Python, NumPy and torch.
 

@@ -126,7 +126,7 @@ check the target, and the axes, the units and the calibration of the sensors
     """
     here, there = ((b, b * math.tan(math.radians(i))) for _, i, b in (reading, target))  # B_H and B_Z
     least_km = (math.dist(here, there) - DISTURBANCE_NT) / MERIDIAN_SLOPE_NT_KM
-    if least_km > most_km:
+    if not least_km <= most_km:
         raise ValueError(
             f"the reading at the start is at least {least_km:.0f} km from the target, and the longest distance is "
             f"{most_km:.0f} km: check the target, and the axes, the units and the calibration of the sensors"
@@ -165,7 +165,7 @@ length explains at most 5000 nT: the reading is wrong, or the distance is
         change = abs(after[index] - before[index])
         change = change if index == 2 else abs(math.sin(math.radians(change / 2)))
         most = DISTURBANCE_NT + SLOPE_NT_KM * distance_km + _SIGMAS * math.sqrt(2) * noise_nt[index]
-        if radius[index] * change > most:
+        if not radius[index] * change <= most:
             raise ValueError(
                 f"{name} changed from {before[index]:g} to {after[index]:g} {unit} over {distance_km:g} km, by "
                 f"{radius[index] * change:.0f} nT of the field vector; a leg of this length explains at most "
@@ -192,12 +192,12 @@ def check_leg(distance: float, distance_std: float, longest: float) -> None:
         Traceback (most recent call last):
         ValueError: distance_std 500 km is more than a leg of 40 km allows, 41 km: it must be in kilometers
     """
-    if distance > LONGER * longest:
+    if not distance <= LONGER * longest:
         raise ValueError(
             f"distance {distance:g} km is longer than the longest leg of this vehicle, {longest:g} km: it must be in "
             "kilometers, and since the last step; report a longer distance in parts, with None between"
         )
-    if distance_std > (most := distance + LEAST_LEG_STD_KM):
+    if not distance_std <= (most := distance + LEAST_LEG_STD_KM):
         raise ValueError(
             f"distance_std {distance_std:g} km is more than a leg of {distance:g} km allows, {most:g} km: it must be "
             "in kilometers"

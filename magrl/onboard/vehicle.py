@@ -18,9 +18,10 @@ from torch import Tensor, nn
 
 from magrl.checks import check_type
 from magrl.files import write_atomically
+from magrl.geodesy import geodesic
 from magrl.onboard import limits
 from magrl.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
-from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
+from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of, finite
 from magrl.onboard.start import check_first_reading, fixed, known_at_start
 from magrl.pilot import Reading, Rules, Track, act, advance, begin, declaring, retargeted
 from magrl.pilot.belief import PLACE
@@ -42,6 +43,8 @@ LONGEST_DISPLACEMENT_KM = 2500.0
 """Estimated distance beyond which an agent without a map is out of range: there its observation saturates."""
 HIGHEST_LATITUDE = 85.0
 """Latitude beyond which a known place is out of range: its region of 90 % held 78 % of the places at 86 to 88° S."""
+ANTIPODE_KM = 150.0
+"""Distance from the antipode of a vehicle within which a destination may have no unique geodesic [km]."""
 _UNCHECKED = {
     "true": "the sign of D and the compass were not checked: give the start",
     "magnetic": "the compass was not checked: give the start",
@@ -68,13 +71,14 @@ class Onboard:
 
     Example:
         >>> vehicle = Onboard("kalman", sensor_std=(0.02, 0.02, 2.0))
-        >>> vehicle.start((-11.6, 75.4, 13240.0))
+        >>> vehicle.start((-11.6, 75.4, 13240.0), target_std=(0.1, 0.05, 30.0))
         >>> command = vehicle.step(3.5, 73.0, 15000.0, heading=290.0)
         >>> command.distance_km, command.stop
         (0.0, None)
     """
 
     _template: Any = None  # a Reading with what the vehicle knows at the start
+    _flown: Any = None  # the other navigator in this flight
 
     def __init__(self, navigator: str | nn.Module = "anywhere", **options: Any) -> None:
         check_type((str, nn.Module), navigator=navigator)
@@ -129,8 +133,8 @@ class Onboard:
             start: latitude and longitude of the start [deg], with a date; or the elements there.
             target_elements: D, I [deg], B_H [nT] that were measured at a target that is given by its place: where the
                 vehicle also knows its own, they show how far the model is off there.
-            target_std: standard deviations of elements that were measured at the destination, with the crust there; 0
-                by default for elements without a place.
+            target_std: standard deviations of the elements of the destination, with the crust there; needed with
+                elements, and (0, 0, 0) for exact ones.
             start_std: standard deviations of the elements at the start, 0 by default.
             date: date of the flight, such as ``"2026-06-30"``.
             model: model of the Earth that the vehicle carries (:func:`magrl.pilot.earth_model`); None for none.
@@ -157,9 +161,12 @@ class Onboard:
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
 
-    def _take(self, journal: Journal) -> None:
-        """Take in what the vehicle knows at the start of a trip."""
+    def _take(self, journal: Journal, place: Tensor | None = None) -> None:
+        """Take in what the vehicle knows at the start of a trip, from a place, by default the one that is given."""
         rules, template = known_at_start(journal)
+        place, there = template.place if place is None else place, template.target_place
+        if not (place is None or there is None) and geodesic(-place[0], place[1] + 180, *there)[0] < ANTIPODE_KM:
+            raise ValueError(f"target {journal.target} is nearly the antipode of the vehicle's place: choose another")
         free = rules.start_km is not None and not (self._network or self._other)  # a filter with a place and a model
         within = limits.ANYWHERE if free else self._range
         if text := limits.out_of_range(within, template.target.tolist()):
@@ -183,7 +190,7 @@ class Onboard:
             raise RuntimeError("the vehicle has no estimate to keep: call start(target) and step() first")
         known["target_elements"] = self._comparable(known.get("target_elements"))
         trip = Destination(target=self._comparable(target), **known)
-        self._take(self._journal.replace(**dict(trip)))
+        self._take(self._journal.replace(**dict(trip)), self._state.place)
         with torch.inference_mode():
             here = self._template._replace(field=torch.tensor(self._last, dtype=torch.float32))
             self._state = retargeted(self._rules, self._state, here)
@@ -226,8 +233,10 @@ class Onboard:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
         given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
         step = Step(**given, heading=heading, distance=distance, distance_std=distance_std, heading_std=heading_std)
-        command = self._after(step)
-        self._steps, self._number = (*self._steps, step), self._number + 1
+        after = copy.copy(self)  # an error changes nothing
+        command = after._after(step)
+        after._steps, after._number = (*self._steps, step), self._number + 1
+        self.__dict__ = after.__dict__
         return command
 
     def fix(self, latitude: float, longitude: float, std_km: float) -> None:
@@ -266,19 +275,19 @@ class Onboard:
             if self._state is None:
                 track = begin(self._rules, reading)
                 check_first_reading(reading, track.tail.item())
-                self._other = self._other and self._other.begun(self.options, reading)
+                self._flown = self._other and self._other.begun(self.options, reading)
             else:
                 track = advance(self._rules, self._state, reading)
             if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
                 raise ValueError("the estimate is not finite after this leg: check its distance and errors")
-            network, other = self._network, self._other
+            network, other = self._network, copy.copy(self._flown)
             action = other.act(reading) if other else act(self._rules, track, reading, network)
             action, decision = declaring(self._rules, track, reading, action)
         if some and (reading.known is not None or self._state is not None):
             doubt = doubt.after(track, first=self._state is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
-        self._last, self._state, self._doubt = elements, track.state, doubt
+        self._last, self._state, self._doubt, self._flown = elements, track.state, doubt, other
         return self._command(track, decision, action, course)
 
     def _reading(self, step: Step, read: limits.Incomplete, elements: limits.Triple, course: float) -> Reading:
@@ -298,8 +307,9 @@ class Onboard:
 
     def _comparable(self, elements: Any) -> Any:
         """Return D, I, B_H, if these are given, with 0 for D where the vehicle does not measure it."""
-        three = elements is not None and len(elements) == 3
-        return (0.0, *elements[1:]) if three and self.options.magnetic else elements
+        given = elements.tolist() if hasattr(elements, "tolist") else elements
+        three = isinstance(given, Sequence) and len(given) == 3
+        return (0.0, *given[1:]) if three and self.options.magnetic else elements
 
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
@@ -328,7 +338,10 @@ class Onboard:
         (nn, ne), (en, ee) = track.displacement.covariance.tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
         found = estimates_of(track.state, located=self._rules.start_km is not None)
-        return Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
+        command = Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
+        if not finite(vars(command).values()):
+            raise ValueError("the command is not finite after this leg: check its distance and errors, and the target")
+        return command
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""

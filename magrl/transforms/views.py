@@ -243,7 +243,7 @@ class ObservationView(_View):
         for name, unit, lowest, highest, least, most, low, high in zip(
             NAMES, ("°", "°", " nT"), *self.field_limits, *ends, strict=True
         ):
-            if low < lowest or high > highest:
+            if not lowest <= low <= high <= highest:
                 raise ValueError(
                     f"the policy was trained where {name} is {least:.1f} to {most:.1f}{unit}; here it is {low:.1f} to "
                     f"{high:.1f}{unit}: train one for this region and date"

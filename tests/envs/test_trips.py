@@ -189,6 +189,7 @@ MISTAKES = {
     "latitude 95": checked(GOOD, f64([-5.0, 165.0], [95.0, 165.0])),
     r"start of trip 1 .*, \[1.0, 165.0\], lies outside": checked(f64([-5.0, 165.0], [1.0, 165.0]), GOOD),
     "trip 1 .* starts at its destination": checked(GOOD, f64([-8.0, 164.0], [-2.000008, 522.0])),
+    "nearly its antipode": lambda: check_trips(Trips(f64([30.0, 10.0]), f64([-29.9, -170.1])), Regions.of(WORLD)),
     r"trips.region 1 is not in \[0, 1\)": checked(GOOD, GOOD.flip(0), ZERO + 1),
     r"trips.region must hold 2 indices, one a trip, got \(1,\)": checked(GOOD, GOOD.flip(0), ZERO[:1]),
     r"no two points of Region\(latitude=\(0.0, 1.0\).* more than 157 km": drawn((200, 300), "area"),

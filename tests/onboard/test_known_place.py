@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -81,7 +83,10 @@ def test_the_elements_of_the_destination_count_where_they_are_given() -> None:
 
 def test_a_destination_by_coordinates_has_the_errors_of_the_model() -> None:
     """A vehicle that does not know its start compares elements, and those are not exact."""
-    by_place, by_elements = begun(start=None), begun(start=None, target=tuple(elements_at(FIELD, f64(*NEAR)).tolist()))
+    by_place, by_elements = (
+        begun(start=None),
+        begun(start=None, target=elements_at(FIELD, f64(*NEAR)), target_std=(0, 0, 0)),
+    )
     near, exact = (vehicle.step(*at(0.0), heading=0.0).error_km for vehicle in (by_place, by_elements))
     assert near > exact + 5
 
@@ -163,6 +168,38 @@ def test_an_estimate_that_is_not_finite_is_refused_and_changes_nothing(monkeypat
         with pytest.raises(ValueError, match=r"the estimate is not finite after this leg: check its distance"):
             vehicle.step(*at(0.0, -120.0), **step)
     assert vehicle.step(*at(0.0, -120.0), **step) == other.step(*at(0.0, -120.0), **step)
+
+
+DOORS: Any = {
+    "start": lambda vehicle, *place: vehicle.start(place, (30.0, 10.0), date=DATE),
+    "retarget": lambda vehicle, *place: vehicle.retarget(place),
+    "fix": lambda vehicle, *place: vehicle.fix(*place, std_km=9.0),
+}
+
+
+def test_no_command_has_a_number_that_is_not_finite() -> None:
+    """Of a place about the antipode, at each door, or after a leg that leads there; what is refused changes nothing."""
+    here, *south = readings = [elements_at(FIELD, f64(30.0 - 0.375 * number, 10.0)).tolist() for number in range(5)]
+    refused = []
+    for door, (north, east) in itertools.product(DOORS, ((0.0, 0.0), (0.0, 0.5), (1.5, 0.0), (0.0, 2.0))):
+        vehicle = begun(target=(30.5, 10.0), start=(30.0, 10.0))
+        commands, other = [vehicle.step(*here, 0.0)], copy.deepcopy(vehicle)
+        try:
+            DOORS[door](vehicle, north - 30.0, east - 170.0)
+            commands.append(vehicle.step(*here, 0.0))
+            for reading in south:
+                other = copy.deepcopy(vehicle)
+                commands.append(vehicle.step(*reading, heading=180.0, distance=41.57))
+        except ValueError:
+            refused.append((door, len(commands) > 1))
+            for each in (vehicle, other):
+                each.retarget((30.5, 10.0))
+            last = readings[max(0, len(commands) - 2)]
+            commands += [each.step(*last, 0.0) for each in (vehicle, other)]
+            assert commands[-1] == commands[-2]
+        assert "nan" not in repr(commands)
+    late = {"start": (False, False, True), "retarget": (False, False, True), "fix": (False,) * 4}
+    assert refused == [(door, after) for door, calls in late.items() for after in calls]
 
 
 @pytest.mark.parametrize(("std_km", "reset"), [(1.0, True), (99.0, False)])
