@@ -46,7 +46,7 @@ class Aboard:
 
     def __call__(self) -> None:
         if self.number % len(self.readings) == 0:
-            self.vehicle.start(self.target)
+            self.vehicle.start(self.target, target_std=(0.0, 0.0, 0.0))
         self.vehicle.step(*self.readings[self.number % len(self.readings)])
         self.number += 1
 

@@ -114,16 +114,17 @@ def _destination(journal: Journal, model: EarthModel | None) -> tuple[Triple, Tr
     """Return the elements of the destination and their standard deviations; they count as measured where given."""
     target, std = known_elements(journal.target, "target", model)
     measured, by_place = journal.target_elements, len(journal.target) == 2
+    if journal.target_std is None and not (by_place and measured is None):
+        raise ValueError(
+            "elements of a target need target_std, their errors with the field of the crust there, such as "
+            "(0.1, 0.05, 30), or (0, 0, 0) where they are exact"
+        )
     if measured is None:
         if by_place and journal.target_std is not None:
             raise ValueError(f"target_std {journal.target_std} needs the target_elements that have these errors")
         return target, journal.target_std or std
     if not by_place:
         raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
-    if journal.target_std is None:
-        raise ValueError(
-            "target_elements need target_std, their errors with the field of the crust there, such as (0.1, 0.05, 30)"
-        )
     measured, _ = known_elements(measured, "target_elements", None)
     assert model is not None
     _check_measured((measured, target), (journal.target_std, std), model.error_nt, journal.options.magnetic)
@@ -210,7 +211,7 @@ def fixed(state: State, fix: Fix) -> State:
     place = _f64((fix.latitude, fix.longitude))
     new = position_fix(state.belief, place, fix.std_km)
     off_km, likely_km = new.residual.norm().item(), new.covariance[:2, :2].trace().sqrt().item()
-    if new.square().item() > FIX_SQUARE:
+    if not new.square().item() <= FIX_SQUARE:  # NaN at the antipode
         raise ValueError(
             f"the fix is {off_km:.0f} km from the estimated place, where {likely_km:.0f} km is likely: check the fix, "
             "or state a larger std_km"

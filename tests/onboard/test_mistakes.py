@@ -22,6 +22,7 @@ UPWARD = {"target_elements": (2.84, -73.05, 15003.0), "target_std": (0.5, 0.1, 2
 
 def start(target: Any = TARGET, here: Any = None, navigator: Any = "anywhere", **known: Any) -> Onboard:
     vehicle = Onboard(navigator, sensor_std=NOISE)
+    known = {"target_std": (0.0, 0.0, 0.0)} | known if len(target) == 3 else known
     vehicle.start(target, here, **known)
     return vehicle
 
@@ -62,6 +63,7 @@ def test_elements_that_are_not_possible() -> None:
             door(elements)
 
 
+UNSTATED = r"elements of a target need target_std, .* such as \(0\.1, 0\.05, 30\), or \(0, 0, 0\)"
 MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] = [
     (Onboard, ("dowsing",), {}, "unknown navigator 'dowsing': choose anywhere"),
     (Onboard, (Geodesic(),), {}, "Geodesic reads position, target_position, which a vehicle does not know"),
@@ -86,7 +88,12 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (start, (TARGET, HERE), {"date": "tomorrow", "model": None}, "tomorrow"),
     (start, (TARGET, HERE), {"start_std": (0.1, -1.0, 5.0)}, "start_std must be a finite number from 0 on, got -1"),
     (start, (TARGET,), {"target_elements": TARGET}, "target_elements .* need the place of the target"),
-    (start, (BERGEN,), DATE | {"target_elements": THERE}, r"target_elements need target_std, .* such as \(0\.1"),
+    *((start, (TARGET, here), {**DATE, "target_std": None}, UNSTATED) for here in (None, HERE, BERGEN)),
+    (start, (BERGEN,), DATE | {"target_elements": THERE}, UNSTATED),
+    *(
+        (door, (5,), {}, "target.* must be")
+        for door in (Onboard("kalman").start, Onboard("kalman", north="magnetic").start)
+    ),
     (start, (BERGEN,), DATE | {"target_std": NOISE}, "target_std .* needs the target_elements"),
     (start, (BERGEN,), DATE | UPWARD, "target_elements .* do not fit the target, .*: it fits with -I"),
     (

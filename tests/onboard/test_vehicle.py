@@ -62,7 +62,7 @@ def begun(
     name: Any = "secant", target: Any = TARGET, start: Any = None, start_std: Any = None, **options: Any
 ) -> Onboard:
     vehicle = Onboard(name, **options)
-    vehicle.start(target, start, start_std=start_std)
+    vehicle.start(target, start, start_std=start_std, target_std=NONE)
     return vehicle
 
 
@@ -122,7 +122,7 @@ def test_commands_are_those_of_the_environment(
     vehicle = Onboard(name, north=north, sensor_std=sensor_std, max_steps=50, confidence=0.0)
     restart(env)
     target = env.reset()["target_field"][0].tolist()
-    vehicle.start((None, *target[1:]) if magnetic else target)
+    vehicle.start((None, *target[1:]) if magnetic else target, target_std=NONE)
     outages = []
     for command, state, after in fly(env, policy, vehicle, 99 if name == "kalman" else 6, none=int(magnetic)):
         check(command, state, after)
@@ -185,8 +185,8 @@ def test_commands_of_own_policies(kind: str, tmp_path: Path) -> None:
 def test_a_policy_of_a_region_stays_in_its_range() -> None:
     vehicle = Onboard(region_policy())
     with pytest.raises(ValueError, match=r"the target: D -11\.6 deg is out of the range of the navigator"):
-        vehicle.start(TARGET)
-    vehicle.start((9.0, -25.0, 34500.0))
+        vehicle.start(TARGET, target_std=NONE)
+    vehicle.start((9.0, -25.0, 34500.0), target_std=NONE)
     with pytest.raises(ValueError, match=r"the reading at the start: D 3\.5 deg is out of the range"):
         vehicle.step(*HERE, 0.0)
     vehicle.step(9.0, -36.5, 35000.0, 180.0)
@@ -225,7 +225,7 @@ def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
             del sys.modules[name]
         sys.modules |= {name: None for name in list(sys.modules) if name.partition(".")[0] in ("torchrl", "tensordict")}
         vehicle = importlib.import_module("magrl.onboard").Onboard("anywhere", sensor_std=NOISE)
-        vehicle.start(TARGET)
+        vehicle.start(TARGET, target_std=NONE)
         vehicle.step(*HERE, 290.0)
         vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
         sys.setprofile(profile)
@@ -259,13 +259,14 @@ def test_a_first_reading_that_does_not_fit_the_start_is_refused(reading: Triple,
 def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
     """With the accuracy of the model, by which iron is noticed; and with a larger one, of a coarse place."""
     vehicle, here = Onboard("secant", sensor_std=SensorStd(bias=(0.5, 0.0, 0.0))), at(60.4, 5.3)
-    vehicle.start(TARGET, (60.4, 5.3), date="2026-06-30")
+    known: Any = {"date": "2026-06-30", "target_std": NONE}
+    vehicle.start(TARGET, (60.4, 5.3), **known)
     with pytest.raises(ValueError, match=r"D deviates by 4\.3.*: check sensors, calibration"):
         vehicle.step(here[0] - 4.3, here[1] + 0.6, here[2] - 500, heading=0.0)  # iron, or nearly -D
-    vehicle.start(TARGET, (60.4, 5.3), start_std=(2.0, 0.7, 600.0), date="2026-06-30")
+    vehicle.start(TARGET, (60.4, 5.3), start_std=(2.0, 0.7, 600.0), **known)
     with pytest.raises(ValueError, match=r"\(I deviates by 80.75, where 3\.6. is likely\): check sensors, calibration"):
         vehicle.step(-8.0, -7.7, 35603.0, heading=0.0)
-    vehicle.start(TARGET, (60.4, 5.3), start_km=100.0, date="2026-06-30")
+    vehicle.start(TARGET, (60.4, 5.3), start_km=100.0, **known)
     assert vehicle.step(*at(58.5, 5.3), heading=0.0).reason == ""
     assert begun().step(*HERE, 290.0).reason == "the sign of D and the compass were not checked: give the start"
 
@@ -295,7 +296,7 @@ def test_a_displacement_that_is_longer_than_a_leg_is_reported_in_parts() -> None
 def test_a_restored_vehicle_goes_on_bit_for_bit(name: str, tmp_path: Path) -> None:
     """From each step on, also after a missed reading, whatever kind of number was given."""
     first, path = Onboard(name, sensor_std=np.float32(NOISE), max_steps=np.int64(50)), tmp_path / "state"
-    first.start(torch.tensor(TARGET), HERE, start_std=NOISE)
+    first.start(torch.tensor(TARGET), HERE, start_std=NOISE, target_std=NONE)
     kinds = (np.float64, np.float32, torch.tensor, np.array, float)
     for number, kind in enumerate(kinds):
         reading = (torch.tensor(HERE) + SLOPE @ torch.tensor([4.0, 9.0]) * number).tolist()
@@ -310,12 +311,26 @@ def test_a_restored_vehicle_goes_on_bit_for_bit(name: str, tmp_path: Path) -> No
     assert path.read_bytes() == (tmp_path / "again").read_bytes()
 
 
+@pytest.mark.parametrize("name", ["secant", "memory"])
+def test_a_second_flight_is_that_of_a_new_vehicle(name: str) -> None:
+    """Bit for bit, after one that found errors of its sensors at a known start."""
+    used, new = (Onboard(name, sensor_std=SensorStd(bias=(0.5, 0.2, 40.0))) for _ in range(2))
+    used.start(TARGET, HERE, target_std=NONE)
+    used.step(3.9, 73.2, 15030.0, 290.0)
+    for vehicle in (used, new):
+        vehicle.start(TARGET, target_std=NONE)
+    for number in range(5):
+        reading = (torch.tensor(HERE) + SLOPE @ torch.tensor([4.0, 9.0]) * number).tolist()
+        commands = [vehicle.step(*reading, 66.0, 10.0 * (number > 0)) for vehicle in (used, new)]
+        assert commands[0] == commands[1]
+
+
 def test_a_state_of_another_vehicle_is_refused(tmp_path: Path) -> None:
     path, vehicle = tmp_path / "state", Onboard("secant", sensor_std=NOISE)
     for call in (lambda: vehicle.save(path), lambda: vehicle.step(*HERE, 0.0)):
         with pytest.raises(RuntimeError, match=r"call start\(target\) first"):
             call()
-    vehicle.start(TARGET)
+    vehicle.start(TARGET, target_std=NONE)
     vehicle.save(path)
     others = {"sensor_std": Onboard("secant"), "navigator": Onboard("kalman", sensor_std=NOISE)}
     others["max_leg_km"] = Onboard("secant", sensor_std=NOISE, max_leg_km=20.0)

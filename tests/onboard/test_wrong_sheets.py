@@ -140,7 +140,7 @@ def started(row: Row, conditions: Conditions, target: Place, start: Place, rando
     options = {"confidence": CONFIDENCE, "radius_km": RADIUS_KM, "drift": share, "wander_km": wander_km}
     vehicle = Onboard("kalman", sensor_std=conditions.std, **options)
     goal = elements(field_at(target, row)) if row.elements else target
-    survey = {}
+    survey: dict[str, Any] = {"target_std": (0.0, 0.0, 0.0)} if row.elements else {}
     if row.survey:
         there = elements(field_at(target, row) + row.there_nt * random.choice((-1, 1), 3))
         survey = {"target_elements": tuple(there + SURVEY_STD * random.normal(size=3)), "target_std": SURVEY_STD}
