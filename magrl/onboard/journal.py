@@ -33,14 +33,9 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def finite(values: Any) -> bool:
-    """Return whether all numbers of a record of numbers, texts and tuples of them are finite.
-
-    Example:
-        >>> finite(("lost", 1.0, (0.0, math.nan)))
-        False
-    """
-    return all(finite(x) if isinstance(x, tuple) else not isinstance(x, float) or math.isfinite(x) for x in values)
+def _finite(values: Any) -> bool:
+    """Return whether all numbers among texts, numbers and tuples of them are finite."""
+    return all(_finite(x) if isinstance(x, tuple) else not isinstance(x, float) or math.isfinite(x) for x in values)
 
 
 class Inputs(CheckedModel):
@@ -220,10 +215,10 @@ class Command:
         displacement_km: mean of the displacement to the destination, northward and eastward.
         displacement_covariance_km2: its covariance, by rows.
         confidence: estimated probability that the destination is within ``radius_km`` of the options.
+        error_radius_km: radius that holds the destination with the ``confidence`` of the options.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
             the distance is then 0.
         reason: why to stop, as text; in the first command, what was not checked.
-        error_radius_km: radius that holds the destination with the ``confidence`` of the options.
         place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
         place_covariance_km2: covariance of the place, northward and eastward.
         drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the distance].
@@ -235,8 +230,11 @@ class Command:
         fit: probability that readings as surprising as the first and the last ones occur if everything stated is true;
             below :data:`~magrl.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
 
+    Raises:
+        ValueError: for a number that is not finite.
+
     Example:
-        >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
+        >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0, 96.0).error_km
         5.0
     """
 
@@ -246,9 +244,9 @@ class Command:
     displacement_km: tuple[float, float]
     displacement_covariance_km2: tuple[tuple[float, float], tuple[float, float]]
     confidence: float
+    error_radius_km: float
     stop: str | None = None
     reason: str = ""
-    error_radius_km: float = math.inf
     place: tuple[float, float] | None = None
     place_covariance_km2: tuple[tuple[float, float], tuple[float, float]] | None = None
     drift: tuple[float, float] | None = None
@@ -257,6 +255,10 @@ class Command:
     sensor_errors_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
     anomaly_weights: tuple[float, ...] = ()
     fit: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not _finite(vars(self).values()):
+            raise ValueError("the estimate is not finite after this leg: check its distance and errors, and the target")
 
     @property
     def error_km(self) -> float:

@@ -12,6 +12,7 @@ from torch import Tensor
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import field_vector
 from magrl.field.igrf import parse_date
+from magrl.geodesy import geodesic
 from magrl.onboard.journal import Fix, Journal, Triple
 from magrl.onboard.limits import check_earth_reading
 from magrl.onboard.mistakes import deviation, likely_mistake, model_std
@@ -24,6 +25,8 @@ from magrl.pilot.records import State
 from magrl.pilot.step import position_fix
 from magrl.sensor_std import SensorStd
 
+ANTIPODE_KM = 150.0
+"""Distance from the antipode of a vehicle within which a destination may have no unique geodesic [km]."""
 LEAST_TAIL = 0.01
 """Tail probability below which a first reading does not fit the start. Most of it is of large anomalies, which are
 rare: of 144 right starts, none was below it, nor of 144 in the field of a crust."""
@@ -66,14 +69,19 @@ def known_elements(given: Sequence[float], name: str, model: EarthModel | None) 
     return (declination, inclination, intensity), (d, i, h)
 
 
-def known_at_start(journal: Journal) -> tuple[Rules, Reading]:
+def known_at_start(journal: Journal, place: Tensor | None = None) -> tuple[Rules, Reading]:
     """Return the rules of a vehicle, and the template of its readings, which holds what it knows at the start.
 
     A step replaces ``field``, ``distance``, ``heading``, ``step`` and ``leg_std`` of the template, and the noise of an
     element that was not read.
 
+    Args:
+        journal: what is given at the start.
+        place: where the vehicle is, if that is another place than the one given.
+
     Raises:
-        ValueError: for a place without a model, or elements that are not possible on the Earth.
+        ValueError: for a place without a model, elements that are not possible on the Earth, or a destination about
+            the antipode.
     """
     options, model = journal.options, _carried_model(journal)
     target, target_std = _destination(journal, model)
@@ -85,6 +93,9 @@ def known_at_start(journal: Journal) -> tuple[Rules, Reading]:
     if places and len(journal.target) == 2:
         rules["target_km"], places["target_place"] = journal.target_km, _f64(journal.target)
         rules["target_std"] = None if journal.target_elements is None else target_std
+        latitude, longitude = places["place"] if place is None else place
+        if geodesic(-latitude, longitude + 180, *places["target_place"])[0] < ANTIPODE_KM:
+            raise ValueError(f"target {journal.target} is nearly the antipode of the vehicle's place: choose another")
     rows = torch.tensor([target, *_start(journal, model)], dtype=torch.float32)
     if options.magnetic:
         rows[:2, 0] = 0.0

@@ -18,10 +18,9 @@ from torch import Tensor, nn
 
 from magrl.checks import check_type
 from magrl.files import write_atomically
-from magrl.geodesy import geodesic
 from magrl.onboard import limits
 from magrl.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
-from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of, finite
+from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
 from magrl.onboard.start import check_first_reading, fixed, known_at_start
 from magrl.pilot import Reading, Rules, Track, act, advance, begin, declaring, retargeted
 from magrl.pilot.belief import PLACE
@@ -43,8 +42,6 @@ LONGEST_DISPLACEMENT_KM = 2500.0
 """Estimated distance beyond which an agent without a map is out of range: there its observation saturates."""
 HIGHEST_LATITUDE = 85.0
 """Latitude beyond which a known place is out of range: its region of 90 % held 78 % of the places at 86 to 88° S."""
-ANTIPODE_KM = 150.0
-"""Distance from the antipode of a vehicle within which a destination may have no unique geodesic [km]."""
 _UNCHECKED = {
     "true": "the sign of D and the compass were not checked: give the start",
     "magnetic": "the compass was not checked: give the start",
@@ -154,19 +151,15 @@ class Onboard:
         self._take(journal)
         self._journal = journal
         self._steps: tuple[Step | Fix | Destination, ...] = ()
-        self._number = 0  # of steps without fixes
         self._state: State | None = None
         self._last: Any = None  # the last elements
         self._doubt = Doubt()
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
-        self._unread_km = 0.0  # path since the last complete reading
+        self._number, self._unread_km = 0, 0.0  # steps without fixes, and path since the last complete reading
 
     def _take(self, journal: Journal, place: Tensor | None = None) -> None:
         """Take in what the vehicle knows at the start of a trip, from a place, by default the one that is given."""
-        rules, template = known_at_start(journal)
-        place, there = template.place if place is None else place, template.target_place
-        if not (place is None or there is None) and geodesic(-place[0], place[1] + 180, *there)[0] < ANTIPODE_KM:
-            raise ValueError(f"target {journal.target} is nearly the antipode of the vehicle's place: choose another")
+        rules, template = known_at_start(journal, place)
         free = rules.start_km is not None and not (self._network or self._other)  # a filter with a place and a model
         within = limits.ANYWHERE if free else self._range
         if text := limits.out_of_range(within, template.target.tolist()):
@@ -233,10 +226,9 @@ class Onboard:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
         given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
         step = Step(**given, heading=heading, distance=distance, distance_std=distance_std, heading_std=heading_std)
-        after = copy.copy(self)  # an error changes nothing
-        command = after._after(step)
-        after._steps, after._number = (*self._steps, step), self._number + 1
-        self.__dict__ = after.__dict__
+        new = copy.copy(self)  # an error changes nothing
+        command, new._steps, new._number = new._after(step), (*self._steps, step), self._number + 1
+        self.__dict__ = new.__dict__
         return command
 
     def fix(self, latitude: float, longitude: float, std_km: float) -> None:
@@ -278,8 +270,6 @@ class Onboard:
                 self._flown = self._other and self._other.begun(self.options, reading)
             else:
                 track = advance(self._rules, self._state, reading)
-            if not torch.isfinite(track.state.mean.sum() + track.state.covariance.sum()):
-                raise ValueError("the estimate is not finite after this leg: check its distance and errors")
             network, other = self._network, copy.copy(self._flown)
             action = other.act(reading) if other else act(self._rules, track, reading, network)
             action, decision = declaring(self._rules, track, reading, action)
@@ -308,8 +298,8 @@ class Onboard:
     def _comparable(self, elements: Any) -> Any:
         """Return D, I, B_H, if these are given, with 0 for D where the vehicle does not measure it."""
         given = elements.tolist() if hasattr(elements, "tolist") else elements
-        three = isinstance(given, Sequence) and len(given) == 3
-        return (0.0, *given[1:]) if three and self.options.magnetic else elements
+        hidden = self.options.magnetic and isinstance(given, Sequence) and len(given) == 3
+        return (0.0, *given[1:]) if hidden else elements
 
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
@@ -336,12 +326,9 @@ class Onboard:
         steer = math.degrees(course + turn) % 360.0
         north, east = track.displacement.mean.tolist()
         (nn, ne), (en, ee) = track.displacement.covariance.tolist()
-        estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
+        estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), radius, stop, reason
         found = estimates_of(track.state, located=self._rules.start_km is not None)
-        command = Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
-        if not finite(vars(command).values()):
-            raise ValueError("the command is not finite after this leg: check its distance and errors, and the target")
-        return command
+        return Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
