@@ -124,22 +124,24 @@ def _start(journal: Journal, model: EarthModel | None) -> list[Triple]:
 def _destination(journal: Journal, model: EarthModel | None) -> tuple[Triple, Triple]:
     """Return the elements of the destination and their standard deviations; they count as measured where given."""
     target, std = known_elements(journal.target, "target", model)
-    measured, by_place = journal.target_elements, len(journal.target) == 2
-    if journal.target_std is None and not (by_place and measured is None):
+    measured, stated, by_place = journal.target_elements, journal.target_std, len(journal.target) == 2
+    if by_place and measured is None:
+        if stated is not None:
+            raise ValueError(f"target_std {stated} needs the target_elements that have these errors")
+        return target, std
+    if stated is None:
         raise ValueError(
             "elements of a target need target_std, their errors with the field of the crust there, such as "
             "(0.1, 0.05, 30), or (0, 0, 0) where they are exact"
         )
     if measured is None:
-        if by_place and journal.target_std is not None:
-            raise ValueError(f"target_std {journal.target_std} needs the target_elements that have these errors")
-        return target, journal.target_std or std
+        return target, stated
     if not by_place:
         raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
     measured, _ = known_elements(measured, "target_elements", None)
     assert model is not None
-    _check_measured((measured, target), (journal.target_std, std), model.error_nt, journal.options.magnetic)
-    return measured, journal.target_std
+    _check_measured((measured, target), (stated, std), model.error_nt, journal.options.magnetic)
+    return measured, stated
 
 
 def _check_measured(elements: Sequence[Triple], std: Sequence[Triple], error_nt: float, magnetic: bool) -> None:
