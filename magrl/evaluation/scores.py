@@ -23,6 +23,7 @@ from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.navigators import Navigator
 from magrl.navigators.names import make_navigator, named
 from magrl.navigators.onnx import OnnxNetwork, has_view
+from magrl.policy_files import reading
 from magrl.random_numbers import FIRST_RESERVED_SEED
 
 SEED = FIRST_RESERVED_SEED + 69
@@ -144,8 +145,15 @@ def _takes_state(act: Callable[..., Any]) -> bool:
 def _of_text(text: str) -> TensorDictModuleBase | str:
     """Return the network of an ONNX file without a view as a policy; otherwise the text of a navigator."""
     path = named(text).file
-    if path is None or path.suffix != ".onnx" or has_view(content := path.read_bytes()):
+    if path is None or path.suffix != ".onnx":
         return text
+    with reading(path):
+        if has_view(content := path.read_bytes()):
+            return text
 
-    network = lru_cache(partial(OnnxNetwork, content))
+    @lru_cache
+    def network(size: int) -> OnnxNetwork:
+        with reading(path):
+            return OnnxNetwork(content, size)
+
     return ArrayPolicy(lambda seen, *_: (network(seen.shape[-1])(torch.from_numpy(seen)), None))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -36,7 +36,8 @@ class OnnxNetwork(nn.Module):
 
     Raises:
         ImportError: without the extra ``onnx``.
-        ValueError: for a file with other inputs or outputs, that does not run, or whose action is not finite.
+        ValueError: for a file with other inputs or outputs, that does not run, that has numbers in another file or
+            loops, or whose action is not finite or depends on other rows.
     """
 
     def __init__(self, content: bytes, size: int) -> None:
@@ -51,9 +52,10 @@ class OnnxNetwork(nn.Module):
                 f"{[each.name for each in inputs]} and {outputs}"
             )
         _check_input(inputs[0], size)
-        action = self(torch.zeros(_CHECKED, size))
+        action = self(observation := _observation(size))
         if action.shape not in [(_CHECKED, 2), (_CHECKED, 3)] or not action.isfinite().all():
             raise ValueError(f"'action' must be finite, (N, 2) or (N, 3), got {short(action.tolist())}")
+        _compare(self, observation, action)
         self.action_size = action.shape[-1]
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -64,24 +66,33 @@ class OnnxNetwork(nn.Module):
 
 
 def with_description(content: bytes, description: Mapping[str, Any]) -> bytes:
-    """Return an ONNX file whose metadata describe its policy, without PyTorch's metadata on where it was exported."""
+    """Return an ONNX file whose metadata describe its policy, without others, which hold paths of a machine."""
     onnx = library("onnx", "onnx")
     model = onnx.load_model_from_string(content)
-    for part in (model.graph, *model.functions):
-        _strip(part)
+    for part in [part for root in (model.graph, *model.functions) for part in _parts(root)]:
+        for name in {"metadata_props", "doc_string"} & {*part.DESCRIPTOR.fields_by_name}:
+            part.ClearField(name)
     entries = {entry.key: entry.value for entry in model.metadata_props}
     onnx.helper.set_model_props(model, entries | {DESCRIPTION: json.dumps({"format": FORMAT, **description})})
     return model.SerializeToString()
 
 
-def _strip(part: Any) -> None:
-    """Remove metadata and comments from a part of a model and all parts in it: they hold paths of a machine."""
+def _parts(part: Any) -> Iterator[Any]:
+    """Yield a part of a model and all parts in it."""
+    yield part
     for field, value in part.ListFields():
-        if field.name in ("metadata_props", "doc_string"):
-            part.ClearField(field.name)
-        elif field.message_type:
+        if field.message_type:
             for each in [value] if hasattr(value, "ListFields") else value:
-                _strip(each)
+                yield from _parts(each)
+
+
+def _check_parts(content: bytes) -> None:
+    """Raise for a network that reads another file, or may never end."""
+    for part in _parts(library("onnx", "onnx").load_model_from_string(content)):
+        if getattr(part, "external_data", ()):
+            raise ValueError(f"{part.name!r} is in another file: write all into one (save_as_external_data=False)")
+        if getattr(part, "op_type", "") == "Loop":
+            raise ValueError("it must be a network without Loop, which may never end")
 
 
 def description_of(content: bytes) -> dict[str, Any]:
@@ -115,8 +126,7 @@ def exported(actor: nn.Module, size: int) -> OnnxNetwork:
         ValueError: for a network that PyTorch cannot export, or whose export acts differently.
     """
     library("onnxscript", "onnx")
-    draw = torch.Generator().manual_seed(0)
-    observation = 2 * torch.rand(_CHECKED, size, generator=draw, dtype=torch.float32) - 1
+    observation = _observation(size)
     modes, validated = {part: part.training for part in actor.modules()}, Distribution._validate_args
     Distribution.set_default_validate_args(False)  # validation reads values, which a trace has not
     try:
@@ -133,6 +143,12 @@ def exported(actor: nn.Module, size: int) -> OnnxNetwork:
     network = OnnxNetwork(content, size)
     _compare(network, observation, wanted.clamp(-1, 1))
     return network
+
+
+def _observation(size: int) -> Tensor:
+    """Return random observations in [-1, 1], without a change of the global random numbers."""
+    draw = torch.Generator().manual_seed(0)
+    return 2 * torch.rand(_CHECKED, size, generator=draw, dtype=torch.float32) - 1
 
 
 class _Step(nn.Module):
@@ -162,7 +178,7 @@ def _compare(network: OnnxNetwork, observation: Tensor, wanted: Tensor) -> None:
         difference = float((network(observation[row : row + 1]) - wanted[row]).abs().max())
         if not difference <= TOLERANCE:
             raise ValueError(
-                f"its export acts differently, by {difference:g}: each row of the outputs must depend on the same row "
+                f"a row alone acts differently, by {difference:g}: each row of the outputs must depend on the same row "
                 "of the inputs alone, without branches on values and without a state that is no input"
             )
 
@@ -180,6 +196,7 @@ def _check_input(found: Any, size: int) -> None:
 @lru_cache(maxsize=8)
 def _session(content: bytes) -> Any:
     """Return the session of a file; outside of the modules, which are copied."""
+    _check_parts(content)
     runtime = library("onnxruntime", "onnx")
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = torch.get_num_threads(), 4

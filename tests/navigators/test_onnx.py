@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from onnx import ModelProto, TensorProto
+from onnx.parser import parse_model
 from support.networks import network_file
 from support.paths import ROOT, with_paths
 from tensordict.nn import NormalParamExtractor, TensorDictModule
@@ -20,7 +21,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
-from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout
+from magrl import GeomagneticNavEnv, evaluate, evaluation_rollout, score
 from magrl.errors import SensorErrors
 from magrl.navigators import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
 from magrl.transforms import ReadingView
@@ -147,6 +148,40 @@ def of_one_row(model: ModelProto) -> None:
 
 def doubled(model: ModelProto) -> None:
     model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+def elsewhere(folder: Path) -> bytes:
+    model = ModelProto.FromString(network_file(folder, 13).read_bytes())
+    model.graph.initializer[0].data_location = TensorProto.EXTERNAL
+    model.graph.initializer[0].external_data.add(key="location", value="own")
+    return model.SerializeToString()
+
+
+def written(nodes: str) -> bytes:
+    head = '<ir_version: 10, opset_import: ["": 18]> network (float[N,13] observation) => (float[N,2] action)'
+    return parse_model(f"{head} {{ two = Constant<value = int64[2] {{0, 1}}>() {nodes} }}").SerializeToString()
+
+
+GATHER = "seen = Gather<axis = 1>(observation, two)"
+BODY = "once (int64 i, bool more, float[N,2] x) => (bool on, float[N,2] y) { on = Identity(more) y = Identity(x) }"
+YEARS = "years = Constant<value = int64 {4000000000000}>() go = Constant<value = bool {1}>()"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (lambda _: written(f"{GATHER} mean = ReduceMean(seen) action = Sub(seen, mean)"), "depend on the same row"),
+        (lambda _: written(f"{GATHER} {YEARS} action = Loop<body = {BODY}>(years, go, seen)"), "without Loop"),
+        (elsewhere, "weights' is in another file"),
+    ],
+)
+def test_a_network_acts_by_its_file_and_one_row_and_ends(content, message: str, tmp_path: Path) -> None:
+    """Else it is refused, with a view as without."""
+    path, view = tmp_path / "own.onnx", GeomagneticNavEnv(seed=3).observation_view()
+    path.write_bytes(content(tmp_path))
+    for read in (lambda: export_policy(path, view), lambda: score(path, "box", episodes=2)):
+        with pytest.raises(ValueError, match=rf"{re.escape(str(path))} does not hold a valid policy: .*{message}"):
+            read()
 
 
 def test_damaged_files_are_refused(own: Path, tmp_path: Path) -> None:
