@@ -272,6 +272,7 @@ def check_writable(path: Path) -> None:
         >>> path.parent.is_dir(), path.exists()
         (True, False)
     """
+    path = path.resolve()  # a link stays, also one to nothing
     existed = path.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

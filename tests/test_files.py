@@ -197,9 +197,14 @@ def test_a_full_disk_names_the_file_and_leaves_it_as_it_was(name: str, tmp_path:
 
 
 def test_check_writable_makes_folders_and_keeps_files(tmp_path: Path) -> None:
+    """And links, also one to nothing."""
     (tmp_path / "old.html").write_text("kept", encoding="utf-8")
-    check_writable(tmp_path / "old.html")
+    for link, end in {"link": "old.html", "dangling": "none"}.items():
+        (tmp_path / link).symlink_to(end)
+    for name in ("old.html", "link", "dangling"):
+        check_writable(tmp_path / name)
     assert (tmp_path / "old.html").read_text(encoding="utf-8") == "kept"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dangling", "link", "old.html"]
     check_writable(tmp_path / "new" / "page.html")
     assert list((tmp_path / "new").iterdir()) == []
     with pytest.raises(OSError, match=r"cannot write .*old\.html/page\.html"):
