@@ -24,9 +24,10 @@ class UsageError(ValueError):
 def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> None:
     """Run a program from the command line.
 
-    What it prints is UTF-8 in every locale. A :class:`UsageError` and an :class:`OSError`, such as of a full disk,
-    are printed in one line, with exit status 2; Ctrl-C ends it with status 130. Where the reader of the output ends
-    first, as in ``command --help | head``, the command ends without a message, with status 141, as after ``SIGPIPE``.
+    What it prints is UTF-8 in every locale, with escapes for other bytes of a path. A :class:`UsageError` and an
+    :class:`OSError`, such as of a full disk, are printed in one line, with exit status 2; Ctrl-C ends it with status
+    130. Where the reader of the output ends first, as in ``command --help | head``, the command ends without a message,
+    with status 141, as after ``SIGPIPE``.
 
     Args:
         name: name of the program in the message.
@@ -39,7 +40,7 @@ def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> Non
     usage: tuple[type[Exception], ...] = (UsageError, OSError, *errors)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(encoding="utf-8")
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
     try:
         try:
             main()

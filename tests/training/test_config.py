@@ -3,6 +3,7 @@
 import importlib
 import io
 import json
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -159,7 +160,7 @@ def test_reader_that_ends_first_leaves_no_traceback(tmp_path: Path, monkeypatch,
 
 
 def test_ctrl_c_ends_a_command_without_a_traceback(capsys, monkeypatch) -> None:
-    """What it prints is UTF-8 in every locale."""
+    """What it prints is UTF-8 in every locale, of any path."""
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -169,5 +170,5 @@ def test_ctrl_c_ends_a_command_without_a_traceback(capsys, monkeypatch) -> None:
     with pytest.raises(SystemExit, match="130"):
         command("mine.py", interrupted)
     assert capsys.readouterr().err.endswith(": interrupted\n")
-    command("mine.py", lambda: print("°"))
-    assert screen.buffer.getvalue().endswith("°\n".encode())
+    command("mine.py", lambda: print("°", Path(os.fsdecode(b"a\xff"))))
+    assert screen.buffer.getvalue().endswith("° a\\udcff\n".encode())
