@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
-from torch import Tensor
+from torch import Tensor, nn
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -213,6 +213,22 @@ def check_type(kind: type | tuple[type, ...], **values: object) -> None:
         if not isinstance(value, kind):
             kinds = kind if isinstance(kind, tuple) else (kind,)
             raise TypeError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {value!r}")
+
+
+def check_float32(network: nn.Module, name: str) -> None:
+    """Raise unless a network has float32 weights, as observations are.
+
+    Raises:
+        TypeError: with the remedy.
+
+    Example:
+        >>> check_float32(nn.Linear(2, 1).double(), "agent")
+        Traceback (most recent call last):
+        TypeError: agent must have float32 weights, as observations are, got torch.float64: .float()
+    """
+    for weight in network.parameters():
+        if weight.is_floating_point() and weight.dtype != torch.float32:
+            raise TypeError(f"{name} must have float32 weights, as observations are, got {weight.dtype}: .float()")
 
 
 def check_choice(choices: Collection[object], **values: object) -> None:

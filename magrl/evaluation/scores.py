@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torch.utils._pytree import tree_map
 
-from magrl.checks import check_number, short
+from magrl.checks import check_float32, check_number, short
 from magrl.envs.measures import summarize
 from magrl.evaluation.arrays import ArrayPolicy
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
@@ -113,9 +113,7 @@ def _policy(agent: Any) -> TensorDictModuleBase | str:
     if hasattr(agent, "predict"):
         return ArrayPolicy(partial(_predicted, agent))
     if isinstance(agent, nn.Module):
-        for weight in agent.parameters():
-            if weight.is_floating_point() and weight.dtype != torch.float32:
-                raise TypeError(f"agent must have float32 weights, as observations are, got {weight.dtype}: .float()")
+        check_float32(agent, "agent")
         return TensorDictModule(agent, ["observation"], ["action"])
     if not callable(agent):
         wanted = "the name or file of a navigator, a module, a model with predict, or a function of observations"
@@ -151,9 +149,10 @@ def _of_text(text: str) -> TensorDictModuleBase | str:
         if has_view(content := path.read_bytes()):
             return text
 
-    @lru_cache
-    def network(size: int) -> OnnxNetwork:
-        with reading(path):
-            return OnnxNetwork(content, size)
+    network = lru_cache(partial(OnnxNetwork, content))
 
-    return ArrayPolicy(lambda seen, *_: (network(seen.shape[-1])(torch.from_numpy(seen)), None))
+    def act(seen: Any, *_: Any) -> tuple[Any, None]:
+        with reading(path):
+            return network(seen.shape[-1])(torch.from_numpy(seen)), None
+
+    return ArrayPolicy(act)

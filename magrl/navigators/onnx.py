@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
@@ -14,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase, set_interaction_type
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from magrl.checks import library, short
+from magrl.checks import check_float32, library, short
 
 DESCRIPTION = "magrl"
 """Entry of the metadata of a file that describes its policy, as JSON."""
@@ -123,20 +124,27 @@ def exported(actor: nn.Module, size: int) -> OnnxNetwork:
 
     Raises:
         ImportError: without the extra ``onnx``.
+        TypeError: for weights of another type than float32.
         ValueError: for a network that PyTorch cannot export, or whose export acts differently.
     """
     library("onnxscript", "onnx")
+    check_float32(actor, "actor")
     observation = _observation(size)
     modes, validated = {part: part.training for part in actor.modules()}, Distribution._validate_args
     Distribution.set_default_validate_args(False)  # validation reads values, which a trace has not
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # no lines on torchvision
     try:
         with torch.no_grad(), set_interaction_type("deterministic"), warnings.catch_warnings(action="ignore"):
             step = _Step(actor).eval()
             wanted, content = step(observation), _written(step, observation)
     except Exception as error:  # whatever the module and PyTorch raise
         reason = str(error.__cause__ or error).strip().partition("\n")[0]
-        raise ValueError(f"PyTorch cannot export it: {reason or type(error).__name__}") from error
+        remedy = ": give the module that was scripted" if isinstance(actor, torch.jit.ScriptModule) else ""
+        raise ValueError(f"PyTorch cannot export it: {reason or type(error).__name__}{remedy}") from error
     finally:
+        log.setLevel(level)
         Distribution.set_default_validate_args(validated)
         for part, mode in modes.items():
             part.training = mode

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import sys
@@ -29,6 +30,7 @@ from magrl.transforms import ReadingView
 NOISE = (0.05, 0.05, 5.0)
 LIMITS = {"max_leg_km": 50.0, "max_turn_rad": math.pi / 2}
 READINGS = ReadingView(**LIMITS)
+OTHERS = (torch.float64, torch.bfloat16, torch.float16)
 
 
 def plain_env(**options: object) -> EnvBase:
@@ -81,12 +83,20 @@ class Calling(nn.Module):
 
 
 def test_what_cannot_be_exported_is_refused_with_its_reason() -> None:
-    for function, message in (
-        (lambda x: squashed(x - x.mean(0)), "acts differently, by .* must depend on the same row"),
-        (lambda x: squashed(x) if x.sum() > 0 else squashed(-x), "PyTorch cannot export it: "),
+    network = nn.Linear(READINGS.size, 2)
+    for actor, message in (
+        (Calling(lambda x: squashed(x - x.mean(0))), "acts differently, by .* must depend on the same row"),
+        (Calling(lambda x: squashed(x) if x.sum() > 0 else squashed(-x)), "PyTorch cannot export it: "),
+        *((nn.Linear(READINGS.size, 2, dtype=dtype), r"float32 weights.*\.float\(\)") for dtype in OTHERS),
+        (torch.jit.script(network), "give the module that was scripted"),
     ):
-        with pytest.raises(ValueError, match=message):
-            export_policy(Calling(function), READINGS)
+        with pytest.raises((TypeError, ValueError), match=message):
+            export_policy(actor, READINGS)
+    warns = []
+    log = logging.getLogger("torch.onnx.exporter")
+    export_policy(Calling(lambda x: warns.append(log.isEnabledFor(logging.WARNING)) or squashed(x)), READINGS)
+    assert not any(warns)
+    assert log.isEnabledFor(logging.WARNING)
 
 
 # Flights
