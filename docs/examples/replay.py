@@ -25,13 +25,16 @@ import tyro
 
 LIMITS = {"D": 180, "I": 90, "B_H": 70_000, "heading": 360, "distance": 100, "latitude": 90, "longitude": 180}
 """Columns of the table, and their greatest absolute values."""
+MOST_ROWS = 10_000
 
 
 def read(path: str) -> torch.Tensor:
     """Return the rows of a table; raise unless its columns are known, and its numbers possible."""
-    table = pd.read_csv(path)
-    if sorted(table) != sorted(LIMITS) or len(table) < 2:
-        raise ValueError(f"expected two or more rows of {', '.join(LIMITS)}, got {len(table)} of {', '.join(table)}")
+    table = pd.read_csv(path, nrows=MOST_ROWS + 1)
+    if sorted(table) != sorted(LIMITS) or not 2 <= len(table) <= MOST_ROWS:
+        raise ValueError(
+            f"expected 2 to {MOST_ROWS} rows of {', '.join(LIMITS)}, got {len(table)} of {', '.join(table)}"
+        )
     for name, most in LIMITS.items():
         numbers = pd.to_numeric(table[name], errors="coerce")
         for row in table.index[~(numbers.abs() <= most)][:1]:

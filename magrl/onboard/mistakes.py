@@ -98,6 +98,7 @@ def _mistakes(elements: Tensor, expected: Tensor) -> dict[str, Tensor]:
         "it fits in radians, and degrees are expected": (d.rad2deg(), i.rad2deg(), b),
         "I fits in radians, and degrees are expected": (d, i.rad2deg(), b),
         "D fits in radians, and degrees are expected": (d.rad2deg(), i, b),
+        "D fits in minutes of arc, and degrees are expected": (d / 60, i, b),
         "D and I are swapped": (i, d, b),
         "it fits with D + 180: the horizontal axes point backward": (d + 180, i, b),
         "it fits with 90 - D: the horizontal axes are swapped": (90 - d, i, b),

@@ -41,7 +41,9 @@ def test_the_ship_arrives_and_its_picture_is_drawn(replayed, tmp_path: Path) -> 
         (lambda table: table.replace({"heading": {290.0: None}}), "heading in row 0 must be at most 360, got nan"),
         (lambda table: table.rename(columns={"distance": "dist_miles"}), "heading, dist_miles"),
         (lambda table: table.assign(b_h=table.B_H), "longitude, b_h"),
-        (lambda table: table.head(1), "two or more rows"),
+        (lambda table: table.assign(D=60 * table.D), "D fits in minutes of arc"),
+        (lambda table: table.head(1), "2 to 10000 rows"),
+        (lambda table: table.loc[[0] * 20_000], "2 to 10000 rows of .*, got 10001"),
     ],
 )
 def test_a_wrong_table_is_refused(replayed, change, message: str) -> None:
