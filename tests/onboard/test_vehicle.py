@@ -424,9 +424,12 @@ def test_the_magnetic_equator_is_no_log_in_radians() -> None:
 
 
 def test_the_last_step_stops_and_says_how_near() -> None:
+    """In each of its trips."""
     vehicle = begun(max_steps=3)
-    stops = [vehicle.step(*HERE, 290.0, distance) for distance in (0.0, 0.5, 0.5)]
-    assert [command.stop for command in stops] == [None, None, "nearest"]
+    for _ in range(2):
+        stops = [vehicle.step(*HERE, 290.0, distance) for distance in (0.0, 0.5, 0.5)]
+        assert [command.stop for command in stops] == [None, None, "nearest"]
+        vehicle.retarget(TARGET, target_std=NONE)
     near = f"within {stops[-1].error_radius_km:.0f} km with an estimated probability of 0.80"
     assert stops[-1].reason == f"out of steps: {near}"
     assert (stops[-1].distance_km, stops[-1].turn_deg) == (0.0, 0.0)

@@ -9,10 +9,12 @@ from torchrl.envs import CatTensors, Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import guidance
+from magrl.envs.navigation import guidance, navigation_env
 from magrl.geodesy import geodesic, move_place
 from magrl.named_tasks import no_go_env
+from magrl.navigators import PolicyConfig
 from magrl.navigators.names import make_navigator
+from magrl.navigators.networks import AreaGeometry
 from magrl.transforms import NoGoAreas, TrueDisplacement
 from magrl.transforms.areas import NUMBER, distance_km, outlines, turned
 
@@ -92,17 +94,32 @@ def test_areas_join_the_observation_alone() -> None:
     assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
 
 
+def test_a_policy_of_areas_sees_their_geometry() -> None:
+    for areas, env in ((True, no_go_env(2)), (False, navigation_env(2))):
+        actor = PolicyConfig(env.view, (8,)).make_actor()
+        assert any(isinstance(layer, AreaGeometry) for layer in actor.modules()) == areas
+
+
 def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused() -> None:
     for reward in ("paper", "base", guidance):
         with pytest.raises(ValueError, match="reward"):
             no_go_env(reward=reward)
 
 
-def test_no_area_covers_a_start_or_a_destination() -> None:
-    """Of the shortest trips, too."""
-    env = no_go_env(64, seed=0, distance_range_km=(30.0, 120.0))
-    centers, radii = NoGoAreas.discs(env.reset()["no_go_areas"])
+def test_areas_of_the_shortest_trips() -> None:
+    """None covers an end, they lie on both sides, and a leg through one that ends at the destination is no success."""
+    env = no_go_env(256, seed=0, distance_range_km=(30.0, 60.0), scale_actions=False, observation="dict")
+    steps = env.rollout(4, make_navigator("geodesic", env.base_env), break_when_any_done=False)
+    before, after = (each["no_go_areas"] for each in (steps, steps["next"]))
+    (centers, radii), start = NoGoAreas.discs(before), before[:, :1, None, -2:]
     assert (centers.norm(dim=-1) > radii).all()
+    right = (centers[..., 1] * start[..., 0] > centers[..., 0] * start[..., 1])[:, 0]
+    assert right.double().mean() == pytest.approx(0.5, abs=0.1)
+    met = (distance_km(centers, before[..., -2:], after[..., -2:]) < radii).any(-1)
+    success = steps["next", "success"].squeeze(-1)
+    assert (met & (after[..., -2:].norm(dim=-1) < 3)).any()
+    assert not (success & met).any()
+    assert success.any()
 
 
 def test_an_outline_is_a_circle_on_the_map() -> None:
