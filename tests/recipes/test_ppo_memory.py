@@ -18,6 +18,7 @@ from magrl.evaluation import evaluation_rollout
 from magrl.navigators import policy_env
 from magrl.navigators.memory import Memory, MemoryNetwork
 from magrl.pilot.network import pretrained
+from magrl.random_numbers import FIRST_RESERVED_SEED
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE
 
 CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=8)
@@ -155,3 +156,17 @@ def test_a_memory_keeps_to_shorter_limits() -> None:
         agent = Memory(network(), max_leg_km=limit)
         assert agent.max_leg_km == min(limit, 50.0)
         assert evaluation_rollout(env, agent)["action"][..., 0].max() <= min(limit, 50.0) + 1e-4
+
+
+def test_a_training_validates_on_storms_of_the_training(tmp_path, monkeypatch) -> None:
+    """Not on the record of evaluations."""
+    seeds = []
+
+    def start(_, validation, **__) -> None:
+        seeds.append(validation.base_env.seed)
+        raise RuntimeError("started")
+
+    monkeypatch.setattr(recipe.Run, "start", start)
+    with pytest.raises(RuntimeError, match="started"):
+        recipe.train(small(recipe, tmp_path / "run", task="storm"))
+    assert seeds[0] < FIRST_RESERVED_SEED
