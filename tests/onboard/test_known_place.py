@@ -131,6 +131,11 @@ def test_a_fix_is_weighed_by_its_error() -> None:
     after = settled(updated(belief, position_fix(belief, place, 3.0)))
     assert geodesic(*f64(*BERGEN), *after.place)[0].item() == pytest.approx(8 * 36 / 45, rel=1e-3)
     assert after.covariance[PLACE, PLACE].trace().item() == pytest.approx(1 / (1 / 36 + 1 / 9))
+    vehicle = begun(start_km=6.0)
+    prior = f64(*vehicle.step(*at(0.0), heading=0.0).place_covariance_km2)
+    vehicle.fix(*vehicle._state.place.tolist(), std_km=3.0)
+    found = vehicle._state.belief.covariance[PLACE, PLACE].inverse() - prior.inverse()
+    torch.testing.assert_close(found, 2 / 9 * torch.eye(2).double(), rtol=0.02, atol=0.005)
 
 
 def test_a_fix_is_restored_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
