@@ -18,6 +18,7 @@ from magrl.geodesy import geodesic, move_place, polar
 from magrl.onboard import Command, Onboard
 from magrl.onboard.doubt import Doubt
 from magrl.pilot import advance, earth_model
+from magrl.pilot.anomalies import reweighed
 from magrl.pilot.belief import PLACE, Motion, at_place, settled, updated
 from magrl.pilot.step import position_fix
 from magrl.sensor_std import OUTAGE_STD, SensorStd
@@ -133,7 +134,10 @@ def test_a_fix_is_weighed_by_its_error() -> None:
     assert after.covariance[PLACE, PLACE].trace().item() == pytest.approx(1 / (1 / 36 + 1 / 9))
     vehicle = begun(start_km=6.0)
     prior = f64(*vehicle.step(*at(0.0), heading=0.0).place_covariance_km2)
+    expected = reweighed(vehicle._state.log_weight, position_fix(vehicle._state.beliefs, vehicle._state.place, 3.0))
+    assert not torch.allclose(expected, vehicle._state.log_weight, atol=1e-3)
     vehicle.fix(*vehicle._state.place.tolist(), std_km=3.0)
+    torch.testing.assert_close(vehicle._state.log_weight, expected)
     found = vehicle._state.belief.covariance[PLACE, PLACE].inverse() - prior.inverse()
     torch.testing.assert_close(found, 2 / 9 * torch.eye(2).double(), rtol=0.02, atol=0.005)
 

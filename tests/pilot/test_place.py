@@ -16,7 +16,8 @@ from magrl.field import IGRF
 from magrl.field.elements import elements_jacobian, measured_elements
 from magrl.geodesy import geodesic, move, move_place
 from magrl.pilot import earth, earth_model
-from magrl.pilot.belief import DRIFT, PLACE, Belief, Motion, at_place, before, moved, read, start
+from magrl.pilot.anomalies import crust_share
+from magrl.pilot.belief import ANOMALY, DRIFT, PLACE, Belief, Motion, at_place, before, moved, read, start
 from magrl.pilot.destination import destination, posterior
 from magrl.pilot.earth import EarthModel, secular_variance
 from magrl.pilot.local import slopes
@@ -199,6 +200,23 @@ def test_they_count_by_their_accuracy(errors: dict) -> None:
     less = told(at_start(), **{name: 100 / 1e6 * value for name, value in errors.items()})
     variances = [one.covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(-1) for one in (told(at_start()), less, before)]
     assert (torch.stack(variances).diff(dim=0) > 0).all()
+
+
+def test_far_from_the_vehicle_its_crust_is_an_anomaly_there() -> None:
+    crust = told(at_start(), crust_nt=300.0)
+    given, none = measured_elements(TRUE(*TARGETS.unbind(-1))), torch.zeros(COUNT).double()
+    there = surveyed(at_start(), given, EXACT, TARGETS, MODEL, none, ERRORS, there_nt=300.0)
+    torch.testing.assert_close(there.mean[:, :3], crust.mean[:, :3], rtol=0.01, atol=0.1)
+    assert (there.mean - told(at_start()).mean)[:, :3].norm(dim=-1).max() > 10
+
+
+def test_at_its_own_place_a_survey_shows_the_field_and_the_anomaly_together() -> None:
+    crust, given = torch.full((COUNT,), 300.0).double(), measured_elements(TRUE(*STARTS.unbind(-1)))
+    after = surveyed(at_start(), given, EXACT, STARTS, MODEL, crust, ERRORS)
+    share = crust_share(after.field, ERRORS, crust)
+    rows = torch.zeros_like(after.covariance[:, :3])
+    rows[..., :3], rows[..., ANOMALY] = torch.eye(3).double(), share
+    assert (rows @ after.covariance @ rows.mT).diagonal(dim1=1, dim2=2).sqrt().max() < 100
 
 
 def test_declination_counts_neither_by_a_compass_nor_where_it_is_missing() -> None:
