@@ -10,6 +10,7 @@ import signal
 import time
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import ppo_anywhere
 import ppo_memory
@@ -98,10 +99,13 @@ def test_a_task_takes_its_preset_unless_another_is_given() -> None:
 
 @pytest.mark.usefixtures("without_figures")
 def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatch) -> None:
-    """Its policy sees areas in training and evaluation, and flies where there are some."""
+    """Actor and critic see areas in training, and the policy flies where there are some."""
     few_steps(monkeypatch, 4)
+    make_critic = Mock(wraps=recipe.make_critic)
+    monkeypatch.setattr(recipe, "make_critic", make_critic)
     recipe.train(small(recipe, tmp_path / "run", task="nogo", reward="progress", total_frames=64, eval_every=4))
     assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
+    assert make_critic.call_args.kwargs["geometry"].observe_areas
     rows, _ = outcome(tmp_path / "run")
     assert all(math.isnan(float(rows[-1][f"return_{term}"])) for term in RETURN_TERMS[:2])  # not parts of the reward
 
