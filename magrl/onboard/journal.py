@@ -16,6 +16,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
+from magrl.onboard.integrity import Separation
 from magrl.pilot import Rules
 from magrl.pilot.belief import CONSTANT, DRIFT, PLACE
 from magrl.pilot.displacement import Displacement
@@ -228,7 +229,8 @@ class Command:
         anomaly_weights: probabilities that anomalies here are as large as each of
             :data:`~magrl.pilot.anomalies.SIZES_NT`.
         fit: probability that readings as surprising as the first and the last ones occur if everything stated is true;
-            below :data:`~magrl.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
+            below :data:`~magrl.onboard.integrity.LEAST_FIT`, a vehicle does not say that it has arrived.
+        separation: what estimates say that do not rely on the stated start or drift, with integrity and a known start.
 
     Raises:
         ValueError: for a number that is not finite.
@@ -255,6 +257,7 @@ class Command:
     sensor_errors_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
     anomaly_weights: tuple[float, ...] = ()
     fit: float = 1.0
+    separation: Separation | None = None
 
     def __post_init__(self) -> None:
         if not _finite(vars(self).values()):

@@ -18,7 +18,7 @@ from magrl.onboard.limits import check_earth_reading
 from magrl.onboard.mistakes import deviation, likely_mistake, model_std
 from magrl.pilot import Reading, Rules, earth_model
 from magrl.pilot.anomalies import recentered, reweighed
-from magrl.pilot.belief import updated
+from magrl.pilot.belief import Innovation, updated
 from magrl.pilot.earth import NEWEST, EarthModel
 from magrl.pilot.planning import SLOPES
 from magrl.pilot.records import State
@@ -215,21 +215,21 @@ FIX_SQUARE = 13.8
 """Normalized square of the deviation of a fix in two axes that right ones exceed with a probability of .001."""
 
 
-def fixed(state: State, fix: Fix) -> State:
-    """Return the state after a fix of the position.
+def fixed(states: State, fix: Fix) -> State:
+    """Return states ``(K, ...)`` after a fix of the position.
 
     Raises:
-        ValueError: for a fix that does not fit the estimated place.
+        ValueError: for a fix that does not fit the place that the first estimates.
     """
     place = _f64((fix.latitude, fix.longitude))
-    new = position_fix(state.belief, place, fix.std_km)
+    new = Innovation(*(part[0] for part in position_fix(states.belief, place, fix.std_km)))
     off_km, likely_km = new.residual.norm().item(), new.covariance[:2, :2].trace().sqrt().item()
     if not new.square().item() <= FIX_SQUARE:  # NaN at the antipode
         raise ValueError(
             f"the fix is {off_km:.0f} km from the estimated place, where {likely_km:.0f} km is likely: check the fix, "
             "or state a larger std_km"
         )
-    new = position_fix(state.beliefs, place, fix.std_km)
-    log_weight = reweighed(state.log_weight, new)
-    mean, covariance, place = recentered(updated(state.beliefs, new), log_weight)
-    return state._replace(mean=mean, covariance=covariance, place=place.squeeze(-2), log_weight=log_weight)
+    new = position_fix(states.beliefs, place, fix.std_km)
+    log_weight = reweighed(states.log_weight, new)
+    mean, covariance, place = recentered(updated(states.beliefs, new), log_weight)
+    return states._replace(mean=mean, covariance=covariance, place=place.squeeze(-2), log_weight=log_weight)

@@ -18,11 +18,11 @@ from torch import Tensor, nn
 
 from magrl.checks import check_type
 from magrl.files import write_atomically
-from magrl.onboard import limits
-from magrl.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
+from magrl.onboard import integrity, limits
+from magrl.onboard.doubt import LOST_SURPRISE, Doubt
 from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
 from magrl.onboard.start import check_first_reading, fixed, known_at_start
-from magrl.pilot import Reading, Rules, Track, act, advance, begin, declaring, retargeted
+from magrl.pilot import Reading, Rules, Track, act, advanced, declaring, estimated, retargeted
 from magrl.pilot.belief import PLACE
 from magrl.pilot.decision import ArrivalDecision
 from magrl.pilot.earth import NEWEST
@@ -98,6 +98,11 @@ class Onboard:
         self.options = given.replace(**shorter, navigator=name, weights=hashlib.sha256(content).hexdigest())
 
     @property
+    def _state(self) -> State | None:
+        """By what is stated."""
+        return self._states and State(*(part[0] for part in self._states))
+
+    @property
     def target(self) -> Any:
         """Elements at the destination; None before :meth:`start`."""
         return None if self._template is None else tuple(self._template.target.tolist())
@@ -151,7 +156,8 @@ class Onboard:
         self._take(journal)
         self._journal = journal
         self._steps: tuple[Step | Fix | Destination, ...] = ()
-        self._state: State | None = None
+        self._states: State | None = None  # by what is stated, and without relying on it
+        self._apart: integrity.Separation | None = None  # between them
         self._last: Any = None  # the last elements
         self._doubt = Doubt()
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
@@ -179,14 +185,14 @@ class Onboard:
             RuntimeError: before the first :meth:`step`.
             ValueError: as :meth:`start`.
         """
-        if self._template is None or self._state is None:
+        if self._template is None or not (self._states and self._state):
             raise RuntimeError("the vehicle has no estimate to keep: call start(target) and step() first")
         known["target_elements"] = self._comparable(known.get("target_elements"))
         trip = Destination(target=self._comparable(target), **known)
         self._take(self._journal.replace(**dict(trip)), self._state.place)
         with torch.inference_mode():
             here = self._template._replace(field=torch.tensor(self._last, dtype=torch.float32))
-            self._state = retargeted(self._rules, self._state, here)
+            self._states = retargeted(self._rules, self._states, here)
         self._steps, self._number = (*self._steps, trip), 0
 
     def step(
@@ -245,10 +251,10 @@ class Onboard:
             ValueError: for a fix that does not fit the estimated place (p < 0.001).
         """
         fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
-        if self._template is None or self._state is None or self._rules.start_km is None:
+        if self._template is None or not (self._states and self._state) or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
         better = std_km**2 < self._state.belief.covariance[PLACE, PLACE].trace().item()
-        self._state = fixed(self._state, fix)
+        self._states = fixed(self._states, fix)
         self._doubt = Doubt(hung=self._doubt.hung) if better else self._doubt
         self._steps += (fix,)
 
@@ -264,20 +270,22 @@ class Onboard:
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
         reading = self._reading(step, read, elements, course)
         with torch.inference_mode():
-            if self._state is None:
-                track = begin(self._rules, reading)
-                check_first_reading(reading, track.tail.item())
+            if self._states is None:
+                states, surprise, tail = integrity.begun(self._rules, reading)
+                check_first_reading(reading, tail[0].item())
                 self._flown = self._other and self._other.begun(self.options, reading)
             else:
-                track = advance(self._rules, self._state, reading)
+                states, surprise, tail = advanced(self._rules, self._states, reading)
+            track = estimated(self._rules, reading, State(*(part[0] for part in states)), surprise[0], tail[0])
+            self._apart = integrity.separation(self._rules, states, reading)
             network, other = self._network, copy.copy(self._flown)
             action = other.act(reading) if other else act(self._rules, track, reading, network)
             action, decision = declaring(self._rules, track, reading, action)
-        if some and (reading.known is not None or self._state is not None):
-            doubt = doubt.after(track, first=self._state is None)
+        if some and (reading.known is not None or self._states):
+            doubt = doubt.after(track, first=self._states is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
-        self._last, self._state, self._doubt, self._flown = elements, track.state, doubt, other
+        self._last, self._states, self._doubt, self._flown = elements, states, doubt, other
         return self._command(track, decision, action, course)
 
     def _reading(self, step: Step, read: limits.Incomplete, elements: limits.Triple, course: float) -> Reading:
@@ -304,7 +312,7 @@ class Onboard:
     def _check(self, step: Step, elements: limits.Triple) -> None:
         """Raise unless elements and a distance are possible together."""
         limits.check_leg(step.distance, step.distance_std, self.options.max_leg_km)
-        if self._state is not None:
+        if self._states is not None:
             since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
             limits.check_earth_jump(self._last, elements, since_km, noise)
             return
@@ -328,7 +336,9 @@ class Onboard:
         (nn, ne), (en, ee) = track.displacement.covariance.tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), radius, stop, reason
         found = estimates_of(track.state, located=self._rules.start_km is not None)
-        return Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
+        return Command(
+            distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, separation=self._apart, **found
+        )
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
@@ -347,8 +357,8 @@ class Onboard:
             return None, ""
         if declare and decision.probability.item() >= options.confidence:
             probability = f"an estimated probability of {decision.probability.item():.2f}"
-            if doubt.fit < LEAST_FIT:
-                return "nearest", f"{probability}, but readings do not fit what is stated (p = {doubt.fit:.1g})"
+            if text := integrity.objection(self._rules, doubt.fit, self._apart, track.state.crust_nt.item()):
+                return "nearest", f"{probability}, but {text}"
             return "arrived", f"within {options.radius_km:g} km with {probability}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
         if last:

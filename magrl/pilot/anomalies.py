@@ -29,10 +29,10 @@ from magrl.pilot.local import inverse3
 from magrl.pilot.prior import lasting_covariances
 from magrl.sensor_std import SensorStd
 
-SIZES_NT = (0.0, 30.0, 90.0)
-"""Sizes of the anomaly, standard deviations in each axis [nT]; chosen: the crust of WMMHR has 26 to 42. For sizes
-between them, stated errors are too small."""
-PRIOR = (0.6, 0.3, 0.1)
+SIZES_NT = {3: (0.0, 30.0, 90.0), 5: (0.0, 15.0, 30.0, 60.0, 120.0)}
+"""Sizes of the anomaly by their number, standard deviations in each axis [nT]; chosen: the crust of WMMHR has 26 to 42.
+For sizes between them, stated errors are too small; a vehicle with integrity has five."""
+PRIOR = {3: (0.6, 0.3, 0.1), 5: (0.5, 0.15, 0.15, 0.12, 0.08)}
 """Their probabilities at the start; chosen."""
 CHANGES = 0.003
 """Share of legs after which the size is another one, with these probabilities; chosen. Without it, a vehicle that has
@@ -56,36 +56,37 @@ def crust_share(field: Tensor, errors: SensorStd, crust_nt: Tensor) -> Tensor:
 
 
 @constant
-def sizes() -> Tensor:
-    """Return the sizes ``(H,)`` [nT].
+def sizes(count: int = 3) -> Tensor:
+    """Return the sizes ``(H,)`` [nT], 3 or 5.
 
     Example:
         >>> sizes()
         tensor([ 0., 30., 90.], dtype=torch.float64)
     """
-    return torch.tensor(SIZES_NT, dtype=torch.float64)
+    return torch.tensor(SIZES_NT[count], dtype=torch.float64)
 
 
 def prior_weights(like: Tensor) -> Tensor:
-    """Return the logarithms ``(..., H)`` of the probabilities at the start, for readings ``(..., 3)``."""
-    return torch.tensor(PRIOR, dtype=torch.float64, device=like.device).log().expand(*like.shape[:-1], len(PRIOR))
+    """Return the logarithms ``(..., H)`` of the probabilities at the start, like those of beliefs."""
+    return torch.tensor(PRIOR[like.shape[-1]], dtype=torch.float64, device=like.device).log().expand(like.shape)
 
 
-def side_by_side(belief: Belief, errors: SensorStd) -> Belief:
+def side_by_side(belief: Belief, errors: SensorStd, count: int = 3) -> Belief:
     """Return a belief before its first reading once for each size of the anomaly.
 
     Args:
         belief: without an anomaly but the stated errors.
         errors: accuracy of the readings, tensors ``(..., 3)``.
+        count: number H of the sizes, 3 or 5.
 
     Returns:
         Mean ``(..., H, S)``, covariance ``(..., H, S, S)``, and their place ``(..., 1, 2)``.
     """
-    field, none = belief.field.unsqueeze(-2), sizes().to(belief.mean)[:1]
+    field, every = belief.field.unsqueeze(-2), sizes(count).to(belief.mean)
     errors = SensorStd(*(torch.as_tensor(std).unsqueeze(-2) for std in errors))
-    stated, whole = (lasting_covariances(field, errors, size)[1] for size in (none, sizes().to(belief.mean)))
+    stated, whole = (lasting_covariances(field, errors, size)[1] for size in (every[:1], every))
     added = pad(whole - stated, (ANOMALY.start, STATES - ANOMALY.stop) * 2)
-    mean = belief.mean.unsqueeze(-2).expand(*belief.mean.shape[:-1], len(SIZES_NT), STATES)
+    mean = belief.mean.unsqueeze(-2).expand(*belief.mean.shape[:-1], count, STATES)
     return Belief(mean, belief.covariance.unsqueeze(-3) + added, belief.place.unsqueeze(-2))
 
 

@@ -54,6 +54,8 @@ STATES = COEFFICIENTS + 13
 ANOMALY_KM = 125.0
 """Correlation length of the anomaly [km]. WMMHR, degrees 14 to 133 at the ground, has .9 at 50 km, .62 at 100 km and
 .28 at 150 km; for a ship, it is four hours of magnetic weather."""
+LONGER_KM = 250.0
+"""The same for integrity: with a shorter one, anomalies average out too soon, and arrivals are too sure [km]."""
 MODEL_NT = 2.0
 """Standard deviation of the field by what the model leaves out, in each axis [nT]: .1 to .8 after six legs of 50 km on
 random planets, and more after many."""
@@ -66,11 +68,13 @@ class Motion(NamedTuple):
         model: model of the Earth; None without one.
         drift: constant drift of dead reckoning, standard deviation along each axis as a share of the displacement.
         wander_km: random part of it, standard deviation along each axis after a distance of 1 km [km].
+        anomaly_km: correlation length of anomalies [km].
     """
 
     model: EarthModel | None = None
     drift: float = 0.0
     wander_km: float = 0.0
+    anomaly_km: float = ANOMALY_KM
 
 
 STILL = Motion()
@@ -262,7 +266,7 @@ def moved(
     column = (turn.slope / meridian)[..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
     rise = turn.sin * cos - turn.cos * sin  # sine of the change of the latitude
     after = belief.latitude + torch.rad2deg(rise * (1 + rise * rise / 6))
-    kept, ones = torch.exp(-distance / ANOMALY_KM).unsqueeze(-1), torch.ones_like(belief.mean)
+    kept, ones = torch.exp(-distance / motion.anomaly_km).unsqueeze(-1), torch.ones_like(belief.mean)
     step = torch.cat((0 * ones[..., :COEFFICIENTS], ones[..., COEFFICIENTS:]), -1)
     step[..., COEFFICIENTS], step[..., ANOMALY] = turn.rate, kept.expand_as(step[..., ANOMALY])
     step = torch.diag_embed(step)
@@ -300,7 +304,7 @@ def _moved_by_model(
     carried = torch.stack((none + 1, none, turn * sin, 1 - turn * cos), -1).unflatten(-1, (2, 2))
     ones = torch.ones_like(belief.mean)
     step = torch.diag_embed(torch.cat((0 * ones[..., : PLACE.stop], ones[..., PLACE.stop :]), -1))
-    kept = torch.exp(-distance / ANOMALY_KM)[..., None, None]
+    kept = torch.exp(-distance / motion.anomaly_km)[..., None, None]
     step[..., ANOMALY, ANOMALY] = step[..., ANOMALY, ANOMALY] * kept
     step[..., here, here] = matrix
     step[..., here, PLACE], step[..., PLACE, PLACE] = slope_end @ carried - matrix @ slope, carried

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magrl.checks import CheckedModel
 from magrl.pilot import anomalies
-from magrl.pilot.belief import Belief, LocalElements, Motion
+from magrl.pilot.belief import ANOMALY_KM, LONGER_KM, Belief, LocalElements, Motion
 from magrl.pilot.destination import RANGE_KM, Destination
 from magrl.pilot.displacement import DestinationPosterior, Displacement
 from magrl.pilot.earth import EarthModel
@@ -106,6 +106,8 @@ class Rules(Known, EpisodeRules):
         target_km: root mean square error of the place of the destination [km]; None where it knows the elements alone.
         drift: constant drift of dead reckoning along each axis [share of the distance].
         wander_km: random part of it along each axis after 1 km [km].
+        integrity: whether a claim must hold though start, drift or anomalies are not as stated, on board alone
+            (:mod:`magrl.onboard.integrity`); a known place then has anomalies of five sizes, of a longer range.
 
     Raises:
         ValueError: for a value out of its range, or an unknown name.
@@ -122,6 +124,7 @@ class Rules(Known, EpisodeRules):
     target_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
     drift: Annotated[float, Field(ge=0, le=1)] = 0.0
     wander_km: Annotated[float, Field(ge=0)] = 0.0
+    integrity: bool = False
 
     @model_validator(mode="after")
     def _check_places(self) -> Rules:
@@ -138,7 +141,9 @@ class Rules(Known, EpisodeRules):
     @property
     def motion(self) -> Motion:
         """How place and field go on."""
-        return Motion(self.model if self.start_km is not None else None, self.drift, self.wander_km)
+        if self.start_km is None:
+            return Motion(None, self.drift, self.wander_km)
+        return Motion(self.model, self.drift, self.wander_km, LONGER_KM if self.integrity else ANOMALY_KM)
 
     @property
     def signaled(self) -> bool:
@@ -216,9 +221,14 @@ class State(NamedTuple):
         return NoiseEstimate((weight * self.log_ratio).sum(-2), (weight * self.readings).sum(-2))
 
     @property
+    def sizes(self) -> Tensor:
+        """Sizes ``(H,)`` of the anomaly [nT]."""
+        return anomalies.sizes(self.log_weight.shape[-1]).to(self.mean)
+
+    @property
     def crust_nt(self) -> Tensor:
         """Expected size ``(...)`` of the anomaly [nT], the root of the mean of the squares."""
-        return (self.log_weight.exp() * anomalies.sizes().to(self.mean).square()).sum(-1).sqrt()
+        return (self.log_weight.exp() * self.sizes.square()).sum(-1).sqrt()
 
 
 class Track(NamedTuple):

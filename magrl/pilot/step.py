@@ -71,7 +71,7 @@ def begin(rules: Rules, reading: Reading) -> Track:
         >>> begin(Rules(), Reading(here, torch.tensor([3.0, 66.0, 17500.0]), zero, zero, accuracy, zero)).aim.shape
         torch.Size([2])
     """
-    return _estimated(rules, reading, *_started(rules, reading))
+    return estimated(rules, reading, *started(rules, reading))
 
 
 def advance(rules: Rules, state: State, reading: Reading) -> Track:
@@ -80,13 +80,14 @@ def advance(rules: Rules, state: State, reading: Reading) -> Track:
     The stated noise is always scaled by what the readings show (``noise_estimate``), and a spike
     counts less (:func:`~magrl.pilot.spike_factor`).
     """
-    return _estimated(rules, reading, *_advanced(rules, state, reading))
+    return estimated(rules, reading, *advanced(rules, state, reading))
 
 
-def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
+def started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
     """Return the state at the first reading, no surprise, and the tail probability of the reading."""
     field, none = reading.field, torch.zeros_like(reading.field, dtype=torch.float64)
-    beliefs, log_weight = _first_beliefs(rules, reading), anomalies.prior_weights(field)
+    beliefs = _first_beliefs(rules, reading)
+    log_weight = anomalies.prior_weights(beliefs.mean[..., 0])
     north = _declination(anomalies.mixture(beliefs, log_weight), reading)
     seen = _side_by_side(_true(reading, north))
     first = FIRST * seen.std.noise
@@ -117,7 +118,7 @@ def retargeted(rules: Rules, state: State, reading: Reading) -> State:
         state: after the last reading.
         reading: the last one, with that destination.
     """
-    weights = arrival_weights(reading.field, reading.target, rules.zeta)
+    weights = arrival_weights(reading.field, reading.target, rules.zeta).expand_as(state.weights)
     nothing = torch.zeros_like(state.path), torch.zeros_like(state.home)
     return _surveyed(rules, state._replace(weights=weights, path=nothing[0], home=nothing[1]), reading)
 
@@ -128,7 +129,7 @@ def _first_beliefs(rules: Rules, reading: Reading) -> Belief:
         if reading.place is None:
             raise ValueError(f"start_km {rules.start_km:g} needs the place of the start, as KnownPlace writes it")
         belief = at_place(reading.place, rules.start_km, reading.std, rules.motion)
-        return anomalies.side_by_side(belief, reading.std)
+        return anomalies.side_by_side(belief, reading.std, 5 if rules.integrity else 3)
     if reading.known is None or reading.known_std is None:
         return anomalies.side_by_side(before(reading.field, reading.std, rules.model), reading.std)
     beliefs = anomalies.side_by_side(before(reading.known, reading.std, rules.model), reading.std)
@@ -136,12 +137,12 @@ def _first_beliefs(rules: Rules, reading: Reading) -> Belief:
     return known(beliefs, *given, anomalies.sizes().to(beliefs.mean))
 
 
-def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor, Tensor]:
+def advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor, Tensor]:
     """Return the state after a leg and the reading at its end, and the surprise and tail probability of that."""
     one = _true(reading, state.north)
     seen, own = _side_by_side(one), NoiseEstimate(state.log_ratio, state.readings)
-    std, heading, field, sizes = seen.std.noise, seen.heading, seen.field, anomalies.sizes().to(state.mean)
-    beliefs = moved(state.beliefs, seen.distance, heading, seen.std, rules.motion, sizes)
+    std, heading, field = seen.std.noise, seen.heading, seen.field
+    beliefs = moved(state.beliefs, seen.distance, heading, seen.std, rules.motion, state.sizes)
     if seen.leg_std is not None:
         beliefs = displaced(beliefs, _leg_covariance(seen.leg_std, heading))
     prediction = predicted(beliefs, field, std < math.inf, heading)
@@ -228,7 +229,7 @@ def _true(reading: Reading, north: Tensor) -> Reading:
     return reading._replace(heading=reading.heading + north.to(reading.heading), std=reading.std._replace(noise=noise))
 
 
-def _goal(rules: Rules, state: State, reading: Reading) -> Destination:
+def goal_of(rules: Rules, state: State, reading: Reading) -> Destination:
     belief, crust, errors = state.belief, state.crust_nt, _true(reading, state.north).std
     std = None if rules.target_std is None else torch.tensor(rules.target_std, dtype=torch.float64)
     if rules.target_km is None:
@@ -253,9 +254,9 @@ def _accuracy(state: State, reading: Reading) -> SensorStd:
     return std._replace(noise=(std.noise * state.noise.factor).to(reading.target.dtype))
 
 
-def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, tail: Tensor) -> Track:
+def estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, tail: Tensor) -> Track:
     """Return the track with the estimates and the plan that follow from a state."""
-    goal, local, dtype = _goal(rules, state, reading), elements(state.belief), reading.target.dtype
+    goal, local, dtype = goal_of(rules, state, reading), elements(state.belief), reading.target.dtype
     points = posterior(goal)
     displacement = points.displacement()
     aim = displacement.mean.to(dtype)
@@ -326,7 +327,7 @@ def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> t
     state, left = track.state, rules.max_steps - 1 - reading.step
     price = rules.step_price if reading.price is None else reading.price
     progress = Progress(state.path, state.home, left, price, rules.max_leg_km)
-    goal, std = track.goal or _goal(rules, state, reading), _accuracy(state, reading)
+    goal, std = track.goal or goal_of(rules, state, reading), _accuracy(state, reading)
     decision = arrival_decision(goal, track.posterior, std, progress, rules.radius_km)
     heading = _true(reading, state.north).heading.unsqueeze(-1)
     displacement, stop = (part.to(action.dtype) for part in (decision.displacement, decision.stop_km.unsqueeze(-1)))

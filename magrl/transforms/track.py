@@ -73,6 +73,7 @@ class TrackField(StatefulTransform):
 
     Raises:
         TypeError: for rules of another type.
+        ValueError: for rules with integrity, which is of a vehicle on board.
         ValueError: for an optional key that is not known, or shapes that do not match.
 
     Example:
@@ -99,6 +100,8 @@ class TrackField(StatefulTransform):
         super().__init__(in_keys, **keys)
         rules = Rules() if rules is None else rules
         check_type(Rules, rules=rules)
+        if rules.integrity:
+            raise ValueError("rules with integrity True are of a vehicle on board alone: leave it out")
         self.rules = rules
 
     @property

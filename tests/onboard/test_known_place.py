@@ -17,7 +17,7 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place, polar
 from magrl.onboard import Command, Onboard
 from magrl.onboard.doubt import Doubt
-from magrl.pilot import advance, earth_model
+from magrl.pilot import advance, advanced, earth_model
 from magrl.pilot.anomalies import reweighed
 from magrl.pilot.belief import PLACE, Motion, at_place, settled, updated
 from magrl.pilot.step import position_fix
@@ -166,14 +166,14 @@ def test_a_fix_is_restored_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
 
 def test_an_estimate_that_is_not_finite_is_refused_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     (vehicle, _), (other, _) = sailed(), sailed()
-    step, right = {"heading": 270.0, "distance": 40.0}, advance
+    step, right = {"heading": 270.0, "distance": 40.0}, advanced
 
     def wrong(*given: Any) -> Any:
-        track = right(*given)
-        return track._replace(state=track.state._replace(mean=track.state.mean * float("nan")))
+        states, *rest = right(*given)
+        return states._replace(mean=states.mean * float("nan")), *rest
 
     with monkeypatch.context() as patch:
-        patch.setattr("magrl.onboard.vehicle.advance", wrong)
+        patch.setattr("magrl.onboard.vehicle.advanced", wrong)
         with pytest.raises(ValueError, match=r"the estimate is not finite after this leg: check its distance"):
             vehicle.step(*at(0.0, -120.0), **step)
     assert vehicle.step(*at(0.0, -120.0), **step) == other.step(*at(0.0, -120.0), **step)

@@ -43,7 +43,7 @@ def weights(size: Tensor, drift: Tensor) -> Tensor:
 def test_weights_are_the_probabilities_of_the_sizes() -> None:
     """Over vehicles whose sizes are drawn from the prior, their mean is the share of each; most find the true one."""
     drawn = torch.rand(COUNT, generator=torch.Generator().manual_seed(0)).double()
-    size = torch.searchsorted(f64(*anomalies.PRIOR).cumsum(0), drawn).clamp_max(2)
+    size = torch.searchsorted(f64(*anomalies.PRIOR[3]).cumsum(0), drawn).clamp_max(2)
     found = weights(size, torch.zeros(3).double())
     share = torch.bincount(size, minlength=3) / COUNT
     torch.testing.assert_close(found.mean(0), share.double(), rtol=0, atol=0.03)
@@ -53,14 +53,14 @@ def test_weights_are_the_probabilities_of_the_sizes() -> None:
 def test_stated_errors_are_not_taken_for_an_anomaly() -> None:
     """Slow errors of as many nanotesla as the largest anomaly are stated: readings with them leave the prior as is."""
     found = weights(torch.zeros(COUNT, dtype=torch.int64), f64(0.3, 0.12, 90.0))
-    torch.testing.assert_close(found.mean(0), f64(*anomalies.PRIOR), rtol=0, atol=0.05)
+    torch.testing.assert_close(found.mean(0), f64(*anomalies.PRIOR[3]), rtol=0, atol=0.05)
 
 
 def test_a_new_reference_place_moves_no_place() -> None:
     place, mean = f64((60.0, 5.0), (-20.0, 179.99)), torch.zeros(2, 3, STATES).double()
     mean[..., PLACE] = 20 * randn(2, 3, 2)
     beliefs = Belief(mean, torch.eye(STATES).double().expand(2, 3, STATES, STATES), place.unsqueeze(1))
-    log_weight = f64(*anomalies.PRIOR).log().expand(2, 3)
+    log_weight = f64(*anomalies.PRIOR[3]).log().expand(2, 3)
     after = anomalies.recentered(beliefs, log_weight)
     assert anomalies.mixture(after, log_weight).mean[:, PLACE].abs().max() < 1e-9
     distance, bearing = geodesic(*place.unbind(-1), *after.place.squeeze(1).unbind(-1))

@@ -206,7 +206,7 @@ def test_what_counts_as_code() -> None:
     assert sizes(text) == (7, {"add in line 4": 3})
 
 
-@pytest.mark.parametrize(("folder", "limit"), [("magrl", 250), ("recipes", 200)])
+@pytest.mark.parametrize(("folder", "limit"), [("magrl", 300), ("recipes", 200)])
 def test_modules_and_functions_are_short(folder: str, limit: int) -> None:
     """But for the function ``train`` of a recipe, which shows its loop."""
     found = {f"{path}": sizes(path.read_text(encoding="utf-8")) for path in (ROOT / folder).rglob("*.py")}
