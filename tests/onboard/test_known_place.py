@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from support.tracks import f64
@@ -17,6 +18,7 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place, polar
 from magrl.onboard import Command, Onboard
 from magrl.onboard.doubt import Doubt
+from magrl.onboard.journal import Step
 from magrl.pilot import advance, advanced, earth_model
 from magrl.pilot.anomalies import reweighed
 from magrl.pilot.belief import PLACE, Motion, at_place, settled, updated
@@ -290,6 +292,32 @@ def test_an_element_of_a_sensor_that_hangs_is_not_read_any_more(element: int) ->
         assert command.stop is None
         assert abs(command.place[0] - at_km(40.0 * number)) < 0.02
     assert not any("not read" in command.reason for command in (*hung(), *hung(element, noise=1.0)))
+
+
+def test_digits_coarser_than_the_noise_are_not_found_to_hang_but_a_sensor_that_does_is() -> None:
+    """Of 20 000 legs along which I changes by 0 to 10 times its noise, with digits of half the noise, as many repeat a
+    reading as a normal distribution says; where 5 to 10 are expected, 1 in 100 000 legs does."""
+    vehicle, random, noise = begun(), np.random.default_rng(5), 0.02
+    vehicle.step(*at(0.0), heading=0.0)
+    state, i = vehicle._state, at(0.0)[1]
+    slope = (at(5.0)[1] - at(-5.0)[1]) / 10.0
+    repeated, found = [], []
+    for sizes in random.uniform(0.0, 10.0, 20_000):
+        true = np.array((i, i + sizes * noise)) + random.uniform(0, noise)
+        old, new = np.round((true + noise * random.normal(size=2)) / (noise / 2)) * (noise / 2)
+        repeated.append(old == new)
+        leg = Step(
+            declination=None, inclination=new, horizontal_intensity=None, heading=0.0, distance=sizes * noise / slope
+        )
+        found.append(old == new and Doubt().found(state, (noise,) * 3, (0.0, old, 0.0), leg).hung[1])
+    # Half a noise wide, N(size, 2): the integral over sizes is half, of 10.
+    assert sum(repeated) == pytest.approx(20_000 * 0.5 / 10 / 2, rel=0.1)
+    assert sum(found) <= 1
+    for size, hung_there in ((4.5, False), (5.5, True)):
+        leg = Step(
+            declination=None, inclination=i, horizontal_intensity=None, heading=0.0, distance=size * noise / slope
+        )
+        assert Doubt().found(state, (noise,) * 3, (0.0, i, 0.0), leg).hung[1] == hung_there
 
 
 def test_a_vehicle_whose_sensors_all_hang_is_lost() -> None:
