@@ -44,4 +44,5 @@ def test_the_field_is_that_of_ppigrf_and_a_crust_the_gradient_of_a_potential() -
     moved = at(place, np.array((1.0, 0.0))), at(place, np.array((0.0, 1.0))), place
     slopes = np.array([fields[0].anomaly(x, z) for x, z in zip(moved, (0.0, 0.0, -1.0), strict=True)])
     slopes -= fields[0].anomaly(place, 0.0)  # nT / km northward, eastward, downward
+    assert np.trace(slopes) == pytest.approx(0.0, abs=0.05)
     np.testing.assert_allclose(slopes, slopes.T, atol=0.05)
