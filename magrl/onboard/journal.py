@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import torch
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import from_json
+from torch import Tensor
 
 from magrl.checks import CheckedModel
 from magrl.onboard.integrity import Separation
@@ -27,6 +28,7 @@ LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
 _LAX = Field(strict=False)  # a tuple may be given as a list
 Triple = Annotated[tuple[float, float, float], _LAX]
+_Altitude = Annotated[float | None, Field(ge=-15, le=1000)]  # of the model
 
 
 def _plain(value: Any) -> Any:
@@ -85,6 +87,7 @@ class Options(Inputs, Rules):
         sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
             D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show. The drift is what
             a known start does not show, and what readings average in part.
+        speed_km_h: speed at which ``drift`` and ``wander_km`` are stated; needed with hours.
         navigator: name of the navigator; the vehicle writes it.
         weights: digest of its weights; the vehicle writes it.
 
@@ -101,6 +104,7 @@ looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     target_km: None = None
     north: North = "true"
     sensor_std: Annotated[SensorStd, BeforeValidator(_accuracy)] = PERFECT
+    speed_km_h: Annotated[float | None, Field(gt=0)] = None
     navigator: str = ""
     weights: str = ""
 
@@ -115,6 +119,24 @@ looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
         if not self.magnetic:
             return self.sensor_std
         return self.sensor_std._replace(bias=(math.inf, *self.sensor_std.bias[1:]))
+
+    def drift_km(self, hours: float, distance: float = 0.0) -> Tensor:
+        """Return over which distance dead reckoning drifts in the time of a leg [km].
+
+        Raises:
+            ValueError: without a speed, and for times that are not in hours.
+
+        Example:
+            >>> Options(speed_km_h=18.0).drift_km(10.0)
+            tensor(180., dtype=torch.float64)
+        """
+        if self.speed_km_h is None:
+            raise ValueError(f"hours {hours:g} need the option speed_km_h, at which drift and wander_km are stated")
+        far_km = hours * self.speed_km_h
+        if hours == 0 < distance or self.drift * far_km > FARTHEST_START_KM:
+            text = f"a leg of {distance:g} km, or a drift of {self.drift * far_km:.0f} km, of at most 100 km"
+            raise ValueError(f"hours {hours:g} do not fit {text}: give hours since the last call")
+        return torch.tensor(far_km, dtype=torch.float64)
 
 
 class Step(Inputs):
@@ -134,6 +156,8 @@ class Step(Inputs):
     distance: float = Field(0.0, ge=0)
     distance_std: float = Field(0.0, ge=0, le=FARTHEST_START_KM)
     heading_std: float = Field(0.0, ge=0, le=180)
+    hours: float | None = Field(None, ge=0)
+    altitude_km: _Altitude = None
 
     @property
     def elements(self) -> tuple[float | None, float | None, float | None]:
@@ -154,6 +178,7 @@ class Fix(Inputs):
     latitude: float = Field(ge=-90, le=90)
     longitude: float = Field(ge=-360, le=360)
     std_km: float = Field(gt=0, le=FARTHEST_START_KM)
+    hours: float | None = Field(None, ge=0)
 
 
 class Destination(Inputs):
@@ -169,6 +194,7 @@ class Destination(Inputs):
     target_elements: Triple | None = None
     target_std: Triple | None = None
     target_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
+    target_altitude_km: _Altitude = None
 
 
 class Journal(Destination):
@@ -180,7 +206,7 @@ class Journal(Destination):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[18] = 18
+    format: Literal[19] = 19
     options: Annotated[Options, _LAX]
     start: Annotated[tuple[float, ...], _LAX] | None = None
     start_std: Triple | None = None
@@ -222,7 +248,8 @@ class Command:
         reason: why to stop, as text; in the first command, what was not checked.
         place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
         place_covariance_km2: covariance of the place, northward and eastward.
-        drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the distance].
+        drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the distance;
+            with hours, of the speed of the options].
         drift_covariance: its covariance, by rows.
         sensor_errors: estimated constant errors of D [deg], I [deg], B_H [nT], to be subtracted from readings.
         sensor_errors_std: their standard deviations.

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_number, check_numbers
-from magrl.field.elements import field_vector
+from magrl.field.elements import element_difference, field_vector, measured_elements
 from magrl.field.igrf import parse_date
-from magrl.geodesy import geodesic
+from magrl.geodesy import REFERENCE_RADIUS_KM, geodesic
 from magrl.onboard.journal import Fix, Journal, Triple
 from magrl.onboard.limits import check_earth_reading
 from magrl.onboard.mistakes import deviation, likely_mistake, model_std
 from magrl.pilot import Reading, Rules, earth_model
 from magrl.pilot.anomalies import recentered, reweighed
-from magrl.pilot.belief import Innovation, updated
+from magrl.pilot.belief import Innovation, moved, updated
 from magrl.pilot.earth import NEWEST, EarthModel
 from magrl.pilot.planning import SLOPES
 from magrl.pilot.records import State
@@ -135,10 +135,11 @@ def _destination(journal: Journal, model: EarthModel | None) -> tuple[Triple, Tr
             "(0.1, 0.05, 30), or (0, 0, 0) where they are exact"
         )
     if measured is None:
-        return target, stated
+        return at_flight_altitude(journal, target, journal.target_altitude_km, None), stated
     if not by_place:
         raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
     measured, _ = known_elements(measured, "target_elements", None)
+    measured = at_flight_altitude(journal, measured, journal.target_altitude_km, _f64(journal.target))
     assert model is not None
     _check_measured((measured, target), (stated, std), model.error_nt, journal.options.magnetic)
     return measured, stated
@@ -177,6 +178,29 @@ def _carried_model(journal: Journal) -> EarthModel | None:
     return earth_model(journal.model, journal.date, journal.altitude_km) if journal.model is not None else None
 
 
+def at_flight_altitude(journal: Journal, elements: Triple, altitude_km: float | None, place: Tensor | None) -> Triple:
+    """Return elements that were read at an altitude as they are at the altitude of the flight.
+
+    They differ as by the model of the Earth at a known place, else as the field of a dipole, which is proportional to
+    r^-3.
+
+    Args:
+        journal: with model and altitude of the flight.
+        elements: D, I [deg], B_H [nT].
+        altitude_km: altitude of the reading above the ellipsoid [km]; None for that of the flight.
+        place: ``(2,)`` latitude, longitude [deg], NaN where unknown; or None.
+    """
+    if altitude_km is None or altitude_km == journal.altitude_km:
+        return elements
+    model, (d, i, h) = _carried_model(journal), elements
+    if model is None or place is None or place.isnan().any():
+        return d, i, h * ((REFERENCE_RADIUS_KM + altitude_km) / (REFERENCE_RADIUS_KM + journal.altitude_km)) ** 3
+    field: Any = model.field  # of the Earth, at any altitude
+    flight, there = (measured_elements(field(*place, km)) for km in (journal.altitude_km, altitude_km))
+    d, i, h = (_f64(elements) + element_difference(flight, there)).tolist()
+    return d, i, h
+
+
 def check_first_reading(reading: Reading, tail: float = 1.0) -> None:
     """Raise unless the first reading fits the elements at the start, where they are known.
 
@@ -209,6 +233,13 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     text = text or f"p = {tail:.1g} by what is stated"
     first, start = (_text(row.tolist()) for row in (read, there))
     raise ValueError(f"the first reading, {first}, does not fit the start, {start} ({text}): {cause}")
+
+
+def at_rest(rules: Rules, state: State, drift_km: Tensor) -> State:
+    """Return the state of a vehicle that has drifted at rest as over a distance ``()`` [km]."""
+    still = torch.zeros(1, dtype=torch.float64)
+    mean, covariance, _ = moved(state.beliefs, still, still, motion=rules.motion._replace(drift_km=drift_km))
+    return state._replace(mean=mean, covariance=covariance)
 
 
 FIX_SQUARE = 13.8

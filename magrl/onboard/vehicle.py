@@ -21,7 +21,7 @@ from magrl.files import write_atomically
 from magrl.onboard import integrity, limits
 from magrl.onboard.doubt import LOST_SURPRISE, Doubt
 from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
-from magrl.onboard.start import check_first_reading, fixed, known_at_start
+from magrl.onboard.start import at_flight_altitude, at_rest, check_first_reading, fixed, known_at_start
 from magrl.pilot import Reading, Rules, Track, act, advanced, declaring, estimated, retargeted
 from magrl.pilot.belief import PLACE
 from magrl.pilot.decision import ArrivalDecision
@@ -30,22 +30,14 @@ from magrl.pilot.network import pilot_of
 from magrl.pilot.records import State
 from magrl.sensor_std import OUTAGE_STD
 
-USUAL: dict[str, Any] = {
-    "arrival": "declared",
-    "max_steps": 120,
-    "confidence": 0.8,
-    "drift": 0.03,  # of a log to 3 %, and a current of as much
-    "wander_km": 0.1,
-}
-"""Rules of a vehicle, which replace the defaults of :class:`~magrl.pilot.Rules` and the training's."""
+USUAL: dict[str, Any] = {"arrival": "declared", "max_steps": 120, "confidence": 0.8, "drift": 0.03, "wander_km": 0.1}
+"""Rules of a vehicle, which replace the defaults of :class:`~magrl.pilot.Rules` and the training's; the drift is that
+of a log to 3 %, and a current of as much."""
 LONGEST_DISPLACEMENT_KM = 2500.0
 """Estimated distance beyond which an agent without a map is out of range: there its observation saturates."""
 HIGHEST_LATITUDE = 85.0
 """Latitude beyond which a known place is out of range: its region of 90 % held 78 % of the places at 86 to 88° S."""
-_UNCHECKED = {
-    "true": "the sign of D and the compass were not checked: give the start",
-    "magnetic": "the compass was not checked: give the start",
-}
+_UNCHECKED = {"true": "the sign of D and the compass were", "magnetic": "the compass was"}
 _NOT_STARTED = "the vehicle has no destination yet: call start(target) first"
 
 
@@ -119,6 +111,7 @@ class Onboard:
         model: str | None = NEWEST,
         start_km: float = 0.1,
         target_km: float = 0.1,
+        target_altitude_km: float | None = None,
         altitude_km: float = 0.0,
     ) -> None:
         """Begin an episode to a destination, with what the vehicle knows.
@@ -142,18 +135,16 @@ class Onboard:
             model: model of the Earth that the vehicle carries (:func:`magrl.pilot.earth_model`); None for none.
             start_km: root mean square error of the place of the start [km].
             target_km: the same of the destination.
-            altitude_km: altitude of the flight, for the model [km].
+            target_altitude_km: altitude at which elements of the destination hold [km], by default the flight's.
+            altitude_km: altitude of the flight above the ellipsoid [km], at which the vehicle knows the field.
 
         Raises:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy; a place
                 without a model; or a model that does not cover the date.
         """
         target, target_elements = self._comparable(target), self._comparable(target_elements)
-        given: dict[str, Any] = {"target": target, "start": start, "start_std": start_std, "date": date}
-        given |= {"target_elements": target_elements, "target_std": target_std}
-        given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
-        journal = Journal(options=self.options, **given)
-        self._take(journal)
+        given = {name: value for name, value in locals().items() if name in Journal.model_fields}
+        self._take(journal := Journal(options=self.options, **given))
         self._journal = journal
         self._steps: tuple[Step | Fix | Destination, ...] = ()
         self._states: State | None = None  # by what is stated, and without relying on it
@@ -179,7 +170,7 @@ class Onboard:
 
         Args:
             target: as for :meth:`start`.
-            **known: ``target_elements``, ``target_std`` and ``target_km``, as for :meth:`start`.
+            **known: ``target_elements``, ``target_std``, ``target_km``, ``target_altitude_km``, as for :meth:`start`.
 
         Raises:
             RuntimeError: before the first :meth:`step`.
@@ -205,6 +196,8 @@ class Onboard:
         *,
         distance_std: float = 0.0,
         heading_std: float = 0.0,
+        hours: float | None = None,
+        altitude_km: float | None = None,
     ) -> Command:
         """Return what to do after a leg.
 
@@ -221,6 +214,10 @@ class Onboard:
             distance_std: standard deviation of that length [km], beside the drift of the options, such as for an
                 inertial navigation system.
             heading_std: the same of the heading of the leg [deg].
+            hours: time since the last :meth:`step` or :meth:`fix` [h], in which a vehicle that knows its place drifts,
+                also at rest, as it does at the speed of the options (``speed_km_h``); None to drift by distance.
+            altitude_km: altitude of the reading [km], by default that of :meth:`start`, to which it is reduced: by the
+                model at the known place before the leg, else as the field of a dipole.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -230,14 +227,13 @@ class Onboard:
             raise RuntimeError(_NOT_STARTED)
         if self.options.magnetic and declination is not None:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
-        given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
-        step = Step(**given, heading=heading, distance=distance, distance_std=distance_std, heading_std=heading_std)
+        step = Step(**{name: value for name, value in locals().items() if name in Step.model_fields})
         new = copy.copy(self)  # an error changes nothing
         command, new._steps, new._number = new._after(step), (*self._steps, step), self._number + 1
         self.__dict__ = new.__dict__
         return command
 
-    def fix(self, latitude: float, longitude: float, std_km: float) -> None:
+    def fix(self, latitude: float, longitude: float, std_km: float, *, hours: float | None = None) -> None:
         """Take in a fix of the position, such as a bearing, a sounding or a moment of satellite navigation, which
         counts from the next step on. One that is better than the estimate ends a doubt (``fit``).
 
@@ -245,16 +241,19 @@ class Onboard:
             latitude: of the vehicle at the end of the last leg [deg].
             longitude: the same [deg].
             std_km: root mean square error of the fix [km].
+            hours: time at rest since the last call [h], in which the vehicle drifted, as for :meth:`step`.
 
         Raises:
             RuntimeError: before the first :meth:`step`, or where the vehicle does not know its place.
             ValueError: for a fix that does not fit the estimated place (p < 0.001).
         """
-        fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
-        if self._template is None or not (self._states and self._state) or self._rules.start_km is None:
+        fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km, hours=hours)
+        if self._template is None or not self._states or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
-        better = std_km**2 < self._state.belief.covariance[PLACE, PLACE].trace().item()
-        self._states = fixed(self._states, fix)
+        states, rules = self._states, self._rules
+        states = states if fix.hours is None else at_rest(rules, states, self.options.drift_km(fix.hours))
+        better = std_km**2 < states.belief.covariance[0, PLACE, PLACE].trace().item()
+        self._states = fixed(states, fix)
         self._doubt = Doubt(hung=self._doubt.hung) if better else self._doubt
         self._steps += (fix,)
 
@@ -294,6 +293,9 @@ class Onboard:
         std = self._template.std
         distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
         leg = step.distance_std, step.distance * math.radians(step.heading_std)
+        if step.altitude_km is not None:
+            place = (self._state or self._template).place
+            elements = self._comparable(at_flight_altitude(self._journal, elements, step.altitude_km, place))
         return self._template._replace(
             field=torch.tensor(elements, dtype=torch.float32),
             distance=distance,
@@ -301,6 +303,7 @@ class Onboard:
             std=std._replace(noise=std.noise.masked_fill(missing, OUTAGE_STD)),
             step=torch.tensor(self._number),
             leg_std=torch.tensor(leg, dtype=torch.float64) if any(leg) else None,
+            drift_km=None if step.hours is None else self.options.drift_km(step.hours, step.distance),
         )
 
     def _comparable(self, elements: Any) -> Any:
@@ -316,8 +319,8 @@ class Onboard:
             since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
             limits.check_earth_jump(self._last, elements, since_km, noise)
             return
-        if step.distance != 0:
-            raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
+        if step.distance or step.hours:
+            raise ValueError(f"distance and hours must be 0 in the first step, got {step.distance:g} and {step.hours}")
         if text := limits.out_of_range(self._within, elements):
             raise ValueError(f"the reading at the start: {text}")
         longest = LONGEST_DISPLACEMENT_KM if self._network else self.options.max_steps * self.options.max_leg_km
@@ -328,7 +331,7 @@ class Onboard:
         radius = track.posterior.radius(self.options.confidence).item()
         stop, reason = self._stop(track, decision, radius)
         if not (stop or self._steps or self._template.known is not None):
-            reason = _UNCHECKED[self.options.north]
+            reason = f"{_UNCHECKED[self.options.north]} not checked: give the start"
         reason = reason if stop else self._doubt.text or reason
         distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
         steer = math.degrees(course + turn) % 360.0
@@ -380,7 +383,7 @@ class Onboard:
         return limits.in_radians(self._last[1], slope.item()) if useful[1] else ""
 
     def save(self, path: Path | str) -> None:
-        """Write the arguments of :meth:`start` and of all steps since to a file, for :meth:`restore`.
+        """Write the arguments of :meth:`start` and of all calls since to a file, for :meth:`restore`.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -388,7 +391,8 @@ class Onboard:
         """
         if self._template is None:
             raise RuntimeError(_NOT_STARTED)
-        write_atomically(Path(path), self._journal.replace(steps=self._steps).model_dump_json().encode())
+        journal = self._journal.replace(steps=self._steps)
+        write_atomically(Path(path), journal.model_dump_json().encode())
 
     def restore(self, path: Path | str) -> None:
         """Repeat the steps of a file of :meth:`save`: the same readings then give the same commands, bit for bit.
@@ -402,7 +406,7 @@ class Onboard:
             if value != options[name]:
                 raise ValueError(f"{path} is of a vehicle with another {name}, {value!r}")
         resumed = copy.copy(self)
-        resumed.start(**{name: value for name, value in journal if name not in ("format", "options", "steps")})
+        resumed.start(**journal.model_dump(exclude={"format", "options", "steps"}))
         for step in journal.steps:
             getattr(resumed, step.CALL)(**dict(step))
         self.__dict__ = resumed.__dict__

@@ -69,12 +69,14 @@ class Motion(NamedTuple):
         drift: constant drift of dead reckoning, standard deviation along each axis as a share of the displacement.
         wander_km: random part of it, standard deviation along each axis after a distance of 1 km [km].
         anomaly_km: correlation length of anomalies [km].
+        drift_km: ``(...)`` distance over which it drifts in a leg [km]; None for the length of the leg.
     """
 
     model: EarthModel | None = None
     drift: float = 0.0
     wander_km: float = 0.0
     anomaly_km: float = ANOMALY_KM
+    drift_km: Tensor | None = None
 
 
 STILL = Motion()
@@ -308,7 +310,7 @@ def _moved_by_model(
     step[..., ANOMALY, ANOMALY] = step[..., ANOMALY, ANOMALY] * kept
     step[..., here, here] = matrix
     step[..., here, PLACE], step[..., PLACE, PLACE] = slope_end @ carried - matrix @ slope, carried
-    far = distance[..., None, None]
+    far = (distance if motion.drift_km is None else motion.drift_km)[..., None, None]
     step[..., here, DRIFT], step[..., PLACE, DRIFT] = slope_end * far, torch.eye(2).to(step) * far
     mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
     mean[..., here] = mean[..., here] + new - (matrix @ old.unsqueeze(-1)).squeeze(-1)

@@ -167,6 +167,7 @@ class Reading(NamedTuple):
         place: ``(..., 2)`` latitude, longitude [deg] of the start, where it is known; it counts at the first reading.
         target_place: ``(..., 2)`` the same of the destination.
         leg_std: ``(..., 2)`` standard deviations of the leg, along and across it, beside the drift of the rules [km].
+        drift_km: ``(...)`` distance over which dead reckoning drifts by the rules [km]; None for that of the leg.
     """
 
     field: Tensor
@@ -181,6 +182,7 @@ class Reading(NamedTuple):
     place: Tensor | None = None
     target_place: Tensor | None = None
     leg_std: Tensor | None = None
+    drift_km: Tensor | None = None
 
 
 class State(NamedTuple):

@@ -142,7 +142,8 @@ def advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tenso
     one = _true(reading, state.north)
     seen, own = _side_by_side(one), NoiseEstimate(state.log_ratio, state.readings)
     std, heading, field = seen.std.noise, seen.heading, seen.field
-    beliefs = moved(state.beliefs, seen.distance, heading, seen.std, rules.motion, state.sizes)
+    motion = rules.motion._replace(drift_km=seen.drift_km)
+    beliefs = moved(state.beliefs, seen.distance, heading, seen.std, motion, state.sizes)
     if seen.leg_std is not None:
         beliefs = displaced(beliefs, _leg_covariance(seen.leg_std, heading))
     prediction = predicted(beliefs, field, std < math.inf, heading)
@@ -173,8 +174,9 @@ def _side_by_side(reading: Reading) -> Reading:
     std = SensorStd(*(torch.as_tensor(part).unsqueeze(-2) for part in reading.std))
     distance, heading = reading.distance.unsqueeze(-1), reading.heading.unsqueeze(-1)
     leg_std = None if reading.leg_std is None else reading.leg_std.unsqueeze(-2)
+    far_km = None if reading.drift_km is None else reading.drift_km.unsqueeze(-1)
     field = reading.field.unsqueeze(-2)
-    return reading._replace(field=field, distance=distance, heading=heading, std=std, leg_std=leg_std)
+    return reading._replace(field=field, distance=distance, heading=heading, std=std, leg_std=leg_std, drift_km=far_km)
 
 
 def displaced(belief: Belief, covariance: Tensor) -> Belief:

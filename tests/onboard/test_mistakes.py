@@ -41,6 +41,13 @@ def fix(*values: float) -> None:
     start(BERGEN, BERGEN, "kalman", **DATE).fix(*values)
 
 
+def timed(hours: float, distance: float) -> Any:
+    vehicle = Onboard("kalman", sensor_std=NOISE, speed_km_h=18.0)
+    vehicle.start(BERGEN, BERGEN, **DATE)
+    vehicle.step(*THERE, 290.0)
+    return vehicle.step(*THERE, 290.0, distance, hours=hours)
+
+
 ELEMENTS = {
     (3.5, 73.0, 15.0): "looks like microtesla, and nanotesla are expected",
     (350.5, 73.0, 15000.0): r"declination \[deg\] must be from -180 up to 180, got 350.5: give -9.5",
@@ -102,7 +109,7 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
         DATE | {"target_elements": (9.0, 65.0, 20000.0), "target_std": NOISE},
         "check elements and place",
     ),
-    (first, (*HERE, 0.0, 1.0), {}, "distance must be 0 in the first step"),
+    (first, (*HERE, 0.0, 1.0), {}, "distance and hours must be 0 in the first step, got 1 and None"),
     (first, (3.3, -7.7, 40000.0, 0.0), {}, "at least 3676 km from the target, and the longest distance is 2500 km"),
     (first, (3.5, 88.5, 1500.0, 0.0), {}, "B_H 1500 nT is out of the range of the navigator, 2000 to inf nT"),
     (first, (3.5, None, 15000.0, 0.0), {}, r"inclination \[deg\] must be a finite number .*, got None"),
@@ -111,6 +118,21 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (later, (40.0, 73.0, 15000.0, 290.0, 20.0), {}, "declination changed from 3.5 to 40 deg over 20 km"),
     (later, (*HERE, 290.0, 20.0), {"distance_std": 1e5}, "distance_std must be less than or equal to 100, got 100000"),
     (later, (*HERE, 290.0, 40.0), {"distance_std": 60.0}, "distance_std 60 km is more than a leg of 40 km allows, 41"),
+    (
+        later,
+        (*HERE, 290.0),
+        {"hours": 2.0},
+        "hours 2 need the option speed_km_h, at which drift and wander_km are stated",
+    ),
+    (
+        timed,
+        (7200.0, 0.0),
+        {},
+        "hours 7200 do not fit .* drift of 3888 km, of at most 100 km: give hours since the last",
+    ),
+    (timed, (0.0, 40.0), {}, "hours 0 do not fit a leg of 40 km"),
+    (timed, (-1.0, 0.0), {}, "hours must be greater than or equal to 0, got -1"),
+    (later, (*HERE, 290.0), {"altitude_km": 3000.0}, "altitude_km must be less than or equal to 1000, got 3000"),
     (fix, (60.4, 4.6, 1e18), {}, "std_km must be less than or equal to 100, got 1e[+]18"),
 ]
 """Doors, arguments, and messages."""
