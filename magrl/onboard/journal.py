@@ -198,7 +198,7 @@ class Destination(Inputs):
 
 
 class Journal(Destination):
-    """Hold all inputs of a vehicle since its start, which determine its state with any navigator.
+    """Hold all inputs of a vehicle since its start, which determine its state with any navigator, and its commands.
 
     Example:
         >>> import torch
@@ -215,6 +215,7 @@ class Journal(Destination):
     model: str | None = None
     start_km: float = Field(0.1, ge=0, le=FARTHEST_START_KM)
     steps: Annotated[tuple[Annotated[Step, _LAX] | Annotated[Fix, _LAX] | Annotated[Destination, _LAX], ...], _LAX] = ()
+    commands: Annotated[tuple[dict[str, Any], ...], _LAX] = ()
 
     @classmethod
     def read(cls, path: Path) -> Journal:

@@ -147,6 +147,7 @@ class Onboard:
         self._take(journal := Journal(options=self.options, **given))
         self._journal = journal
         self._steps: tuple[Step | Fix | Destination, ...] = ()
+        self._commands: tuple[dict[str, Any], ...] = ()
         self._states: State | None = None  # by what is stated, and without relying on it
         self._apart: integrity.Separation | None = None  # between them
         self._last: Any = None  # the last elements
@@ -176,11 +177,11 @@ class Onboard:
             RuntimeError: before the first :meth:`step`.
             ValueError: as :meth:`start`.
         """
-        if self._template is None or not (self._states and self._state):
+        if self._template is None or not self._states:
             raise RuntimeError("the vehicle has no estimate to keep: call start(target) and step() first")
         known["target_elements"] = self._comparable(known.get("target_elements"))
         trip = Destination(target=self._comparable(target), **known)
-        self._take(self._journal.replace(**dict(trip)), self._state.place)
+        self._take(self._journal.replace(**dict(trip)), self._states.place[0])
         with torch.inference_mode():
             here = self._template._replace(field=torch.tensor(self._last, dtype=torch.float32))
             self._states = retargeted(self._rules, self._states, here)
@@ -230,6 +231,7 @@ class Onboard:
         step = Step(**{name: value for name, value in locals().items() if name in Step.model_fields})
         new = copy.copy(self)  # an error changes nothing
         command, new._steps, new._number = new._after(step), (*self._steps, step), self._number + 1
+        new._commands += (vars(command),)
         self.__dict__ = new.__dict__
         return command
 
@@ -383,7 +385,8 @@ class Onboard:
         return limits.in_radians(self._last[1], slope.item()) if useful[1] else ""
 
     def save(self, path: Path | str) -> None:
-        """Write the arguments of :meth:`start` and of all calls since to a file, for :meth:`restore`.
+        """Write the arguments of :meth:`start` and of all calls since, and the commands that were returned, to a file
+        of JSON, for :meth:`restore`.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -391,7 +394,7 @@ class Onboard:
         """
         if self._template is None:
             raise RuntimeError(_NOT_STARTED)
-        journal = self._journal.replace(steps=self._steps)
+        journal = self._journal.replace(steps=self._steps, commands=self._commands)
         write_atomically(Path(path), journal.model_dump_json().encode())
 
     def restore(self, path: Path | str) -> None:
@@ -406,7 +409,8 @@ class Onboard:
             if value != options[name]:
                 raise ValueError(f"{path} is of a vehicle with another {name}, {value!r}")
         resumed = copy.copy(self)
-        resumed.start(**journal.model_dump(exclude={"format", "options", "steps"}))
+        resumed.start(**journal.model_dump(exclude={"format", "options", "steps", "commands"}))
         for step in journal.steps:
             getattr(resumed, step.CALL)(**dict(step))
+        resumed._commands = journal.commands  # as they were returned
         self.__dict__ = resumed.__dict__

@@ -12,7 +12,7 @@ from support.tracks import f64
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
 from magrl.onboard import Command, Onboard
-from magrl.onboard.integrity import Separation, objection, separation
+from magrl.onboard.integrity import Separation, objection
 from magrl.pilot import Rules
 from magrl.pilot.belief import PLACE
 from magrl.pilot.records import State

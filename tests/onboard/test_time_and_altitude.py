@@ -3,8 +3,10 @@ geographiclib, the field by ppigrf."""
 
 from __future__ import annotations
 
+import json
 import math
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -157,3 +159,32 @@ def test_elements_of_a_destination_are_reduced_to_the_altitude_of_the_flight(alt
     assert vehicle.target == pytest.approx(level, abs=2e-3)
     vehicle.retarget(place, target_elements=there, target_std=(0.0, 0.0, 0.0))
     assert vehicle.target == pytest.approx(there, abs=2e-3)
+
+
+# The record of a flight
+
+
+def test_a_file_has_times_altitudes_and_commands(tmp_path: Path) -> None:
+    """And the vehicle that is restored from it goes on bit for bit, with the same record."""
+    path, vehicle, commands = tmp_path / "flight.json", begun(), []
+    for number in range(3):
+        given = {"hours": 2.0 * (number > 0), "altitude_km": 0.5}
+        reading = elements(moved(BERGEN, 36.0 * number, 0.0), 0.5)
+        commands.append(vehicle.step(*reading, heading=0.0, distance=36.0 * (number > 0), **given))
+    vehicle.fix(*moved(BERGEN, 72.0, 0.0), std_km=2.0, hours=1.5)
+    vehicle.save(path)
+    record = json.loads(path.read_text(encoding="utf-8"))
+    assert [call["hours"] for call in record["steps"]] == [0.0, 2.0, 2.0, 1.5]
+    assert [call["altitude_km"] for call in record["steps"][:3]] == [0.5] * 3
+    assert record["commands"] == json.loads(json.dumps([vars(command) for command in commands]))
+    again = Onboard("kalman", sensor_std=NOISE, confidence=0.9, speed_km_h=SPEED)
+    again.restore(path)
+    reading = elements(moved(BERGEN, 108.0, 0.0))
+    given = {"heading": 0.0, "distance": 36.0, "hours": 2.0}
+    assert again.step(*reading, **given) == vehicle.step(*reading, **given)
+    for each, name in ((vehicle, "one"), (again, "two")):
+        each.save(tmp_path / name)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    path.write_text(json.dumps(record | {"format": 18}), encoding="utf-8")
+    with pytest.raises(ValueError, match="is not the state of a vehicle: format must be 19, got 18"):
+        again.restore(path)
