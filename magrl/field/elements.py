@@ -178,6 +178,31 @@ def elements_of_axes(axes_nt: Tensor, attitude_deg: Tensor) -> Tensor:
     return measured_elements((rotation(attitude_deg) @ axes_nt.unsqueeze(-1)).squeeze(-1))
 
 
+def elements_covariance(axes_nt: Tensor, attitude_deg: Tensor, axes_std: Tensor, attitude_std: Tensor) -> Tensor:
+    """Return the covariance of :func:`elements_of_axes` ``(..., 3, 3)``, to first order in independent errors.
+
+    Errors of roll and pitch change D, I and B_H together. The roots of the diagonal are standard deviations for
+    :class:`~magrl.sensor_std.SensorStd`: of its noise for errors that are new in each reading, of its bias for others.
+
+    Args:
+        axes_nt: ``(..., 3)`` the field forward, right, down [nT]; not vertical in the world, where D has no meaning.
+        attitude_deg: ``(..., 3)`` roll, pitch, heading [deg].
+        axes_std: ``(..., 3)`` standard deviations of the axes [nT].
+        attitude_std: ``(..., 3)`` standard deviations of roll, pitch, heading [deg].
+
+    Example:
+        >>> axes, level, std = torch.tensor([20000.0, 0.0, 40000.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 0.5])
+        >>> elements_covariance(axes, level, torch.zeros(3), std).diagonal().sqrt()  # the heading is an error of D
+        tensor([0.5000, 0.0000, 0.0000])
+    """
+    given = torch.cat(torch.broadcast_tensors(axes_nt, attitude_deg), -1)
+    std = torch.cat(torch.broadcast_tensors(axes_std, attitude_std), -1)
+    # Rows do not depend on each other: the derivative of their sum holds those of each.
+    total = torch.func.jacrev(lambda rows: elements_of_axes(rows[..., :3], rows[..., 3:]).reshape(-1, 3).sum(0))
+    scaled = total(given).movedim(0, -2) * std.unsqueeze(-2)
+    return scaled @ scaled.mT
+
+
 def axes_of_elements(elements: Tensor, attitude_deg: Tensor) -> Tensor:
     """Return the field along the vehicle's axes [nT] ``(..., 3)``: the inverse of :func:`elements_of_axes`.
 

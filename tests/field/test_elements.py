@@ -2,14 +2,17 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from support.tracks import f64
 
 from magrl.field.elements import (
     element_difference,
+    elements_covariance,
     elements_gradient,
     elements_jacobian,
+    elements_of_axes,
     field_vector,
     measured_elements,
 )
@@ -92,3 +95,41 @@ def test_nan_in_a_component_is_nan_in_what_depends_on_it():
         assert (jacobian[[0, 2], :2].isnan() == horizontal).all()
     assert field_vector(f64(0.0, 0.0, math.nan)).isnan().all()
     assert elements_gradient(f64(1.0, 1.0, 1.0), torch.full((3, 2), math.nan, dtype=torch.float64)).isnan().all()
+
+
+def turned_back(axes, attitude):
+    """Elements by NumPy, from axes ``(N, 3)`` that are turned by roll, then pitch, then heading ``(N, 3)`` [deg]."""
+    (sr, sp, sh), (cr, cp, ch) = np.sin(np.radians(attitude)).T, np.cos(np.radians(attitude)).T
+    forward, right, down = axes.T
+    right, down = cr * right - sr * down, sr * right + cr * down
+    forward, down = cp * forward + sp * down, -sp * forward + cp * down
+    north, east = ch * forward - sh * right, sh * forward + ch * right
+    horizontal = np.hypot(north, east)
+    return np.stack((np.degrees(np.arctan2(east, north)), np.degrees(np.arctan2(down, horizontal)), horizontal), -1)
+
+
+def test_axes_and_an_attitude_are_elements_by_the_signs_of_navigation():
+    """Roll lowers the right side, pitch raises the bow, heading is clockwise from north."""
+    axes = random_fields(500, seed=3)
+    attitude = (torch.rand(500, 3, generator=torch.Generator().manual_seed(4)).double() - 0.5) * 360
+    expected = torch.from_numpy(turned_back(axes.numpy(), attitude.numpy()))
+    torch.testing.assert_close(elements_of_axes(axes, attitude), expected, rtol=0, atol=1e-7)
+
+
+def test_covariance_of_elements_is_that_of_drawn_errors():
+    """Two attitudes, also that of a vehicle that rolls; errors of axes and attitude, each of another size."""
+    axes = torch.tensor([[4000.0, -14000.0, 50000.0], [-9000.0, 21000.0, -30000.0]]).double()
+    attitude = torch.tensor([[2.0, -3.0, 290.0], [25.0, 10.0, 100.0]]).double()
+    axes_std, attitude_std = f64(5.0, 10.0, 20.0), f64(0.02, 0.05, 0.1)
+    found = elements_covariance(axes, attitude, axes_std, attitude_std)
+    random = np.random.default_rng(0)
+    for row in range(2):
+        drawn = [
+            known[row].numpy() + std.numpy() * random.normal(size=(400_000, 3))
+            for known, std in ((axes, axes_std), (attitude, attitude_std))
+        ]
+        expected = torch.from_numpy(np.cov(turned_back(*drawn).T))
+        size = expected.diagonal().sqrt()
+        torch.testing.assert_close(found[row] / size.outer(size), expected / size.outer(size), rtol=0, atol=0.01)
+        alone = elements_covariance(axes[row], attitude[row], axes_std, attitude_std)
+        torch.testing.assert_close(found[row], alone)
