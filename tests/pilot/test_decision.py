@@ -9,6 +9,9 @@ import torch
 from support.tracks import F64, f64, randn
 from torch import Tensor
 
+from magrl.envs import earth_scenario
+from magrl.errors import CONDITIONS
+from magrl.field import IGRF, elements_gradient_at
 from magrl.pilot.belief import STATES, Belief, elements, moved, start
 from magrl.pilot.decision import ArrivalDecision, Progress, approach, arrival_decision
 from magrl.pilot.destination import destination, posterior
@@ -112,3 +115,22 @@ def test_the_approach_turns_where_it_is_if_the_destination_is_behind() -> None:
     displacement = f64((0.0, 30.0), (-30.0, 0.0), (0.0, -80.0))
     action = approach(displacement, torch.zeros(3, 1, dtype=F64), f64(4.0).expand(3, 1), 50.0, math.pi / 2)
     assert action.tolist() == [pytest.approx(row) for row in ([26, math.pi / 2], [0, math.pi / 2], [50, -math.pi / 2])]
+
+
+@pytest.mark.parametrize(("survey", "right", "false"), [((0.1, 0.05, 30.0), 9, 1), ((0.05, 0.02, 10.0), 53, 4)])
+def test_where_nothing_else_is_known_the_survey_bounds_arrivals(survey, right, false):
+    """In percent of flights of a ship, by the best unbiased estimate, which knows the gradients (docs/onboard.md).
+
+    Eight readings leave of noise a share of 1/8, 16 spells of weather of it 1/16 [variance]; the gyrocompass's error
+    stays.
+    """
+    noise, bias, drift = (f64(*std).square() for std in CONDITIONS["ship"].std[:3])
+    variance = f64(*survey).square() + noise / 8 + bias - drift + drift / 16
+    target = earth_scenario(128, seed=5, distance_range_km=(300.0, 500.0)).random_trips(2000, seed=1).target
+    gradient = elements_gradient_at(IGRF("2025-01-01"), target)
+    covariance = torch.linalg.inv(gradient.mT @ (gradient / variance.unsqueeze(-1)))
+    off_km = (randn(2000, 2, seed=0) @ torch.linalg.cholesky(covariance).mT).norm(dim=-1)
+    near = (off_km < RADIUS_KM).double().mean(-1)
+    claims = near >= 0.8
+    assert 100 * (near * claims).mean() == pytest.approx(right, abs=1)
+    assert 100 * ((1 - near) * claims).mean() == pytest.approx(false, abs=1)

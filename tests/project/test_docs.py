@@ -39,7 +39,10 @@ NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
-SCRIPTS = [ROOT / "docs" / "examples" / f"{name}.py" for name in ("ins", "navigator", "sac", "sb3_anywhere", "turns")]
+SCRIPTS = [
+    ROOT / "docs" / "examples" / f"{name}.py"
+    for name in ("autopilot", "ins", "navigator", "sac", "sb3_anywhere", "turns")
+]
 EXAMPLES += [(path, path.read_text(encoding="utf-8")) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
 BUDGET = {
