@@ -121,8 +121,7 @@ def test_the_approach_turns_where_it_is_if_the_destination_is_behind() -> None:
 def test_where_nothing_else_is_known_the_survey_bounds_arrivals(survey, right, false):
     """In percent of flights of a ship, by the best unbiased estimate, which knows the gradients (docs/onboard.md).
 
-    Eight readings leave of noise a share of 1/8, 16 spells of weather of it 1/16 [variance]; the gyrocompass's error
-    stays.
+    Noise averages over 8 readings, weather and iron over 16 (chosen); the gyrocompass's error stays.
     """
     noise, bias, drift = (f64(*std).square() for std in CONDITIONS["ship"].std[:3])
     variance = f64(*survey).square() + noise / 8 + bias - drift + drift / 16
