@@ -235,11 +235,11 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     raise ValueError(f"the first reading, {first}, does not fit the start, {start} ({text}): {cause}")
 
 
-def at_rest(rules: Rules, state: State, drift_km: Tensor) -> State:
-    """Return the state of a vehicle that has drifted at rest as over a distance ``()`` [km]."""
-    still = torch.zeros(1, dtype=torch.float64)
-    mean, covariance, _ = moved(state.beliefs, still, still, motion=rules.motion._replace(drift_km=drift_km))
-    return state._replace(mean=mean, covariance=covariance)
+def at_rest(rules: Rules, states: State, drift_km: Tensor) -> State:
+    """Return the states ``(K, ...)`` of a vehicle that has drifted at rest as over a distance ``()`` [km]."""
+    still = torch.zeros_like(states.log_weight[..., :1])
+    mean, covariance, _ = moved(states.beliefs, still, still, motion=rules.motion._replace(drift_km=drift_km))
+    return states._replace(mean=mean, covariance=covariance)
 
 
 FIX_SQUARE = 13.8
