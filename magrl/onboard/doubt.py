@@ -15,6 +15,8 @@ from magrl.pilot.anomalies import joint_tail
 from magrl.pilot.belief import elements
 from magrl.pilot.records import State
 
+LEAST_FIT = 0.01
+"""Fit of the readings (:class:`Command`) below which a vehicle does not say that it has arrived."""
 LOST_SURPRISE = 20.0
 """Mean of the last surprises (:class:`~magrl.pilot.Track`) beyond which the readings contradict each other. With the
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""

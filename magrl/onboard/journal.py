@@ -17,7 +17,7 @@ from pydantic_core import from_json
 from torch import Tensor
 
 from magrl.checks import CheckedModel
-from magrl.onboard.integrity import Separation
+from magrl.onboard.integrity import Hypothesis
 from magrl.pilot import Rules
 from magrl.pilot.belief import CONSTANT, DRIFT, PLACE
 from magrl.pilot.displacement import Displacement
@@ -242,7 +242,8 @@ class Command:
         heading_deg: heading after that turn, 0 to 360: what to steer.
         displacement_km: mean of the displacement to the destination, northward and eastward.
         displacement_covariance_km2: its covariance, by rows.
-        confidence: estimated probability that the destination is within ``radius_km`` of the options.
+        confidence: estimated probability that the destination is within ``radius_km`` of the options, by all
+            hypotheses.
         error_radius_km: radius that holds the destination with the ``confidence`` of the options.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
             the distance is then 0.
@@ -257,8 +258,9 @@ class Command:
         anomaly_weights: probabilities that anomalies here are as large as each of
             :data:`~magrl.pilot.anomalies.SIZES_NT`.
         fit: probability that readings as surprising as the first and the last ones occur if everything stated is true;
-            below :data:`~magrl.onboard.integrity.LEAST_FIT`, a vehicle does not say that it has arrived.
-        separation: what estimates say that do not rely on the stated start or drift, with integrity and a known start.
+            below :data:`~magrl.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
+        hypotheses: what may be, with its probability and that of an arrival by it: with integrity and a known start
+            that start or drift are not as stated (:mod:`magrl.onboard.integrity`).
 
     Raises:
         ValueError: for a number that is not finite.
@@ -285,7 +287,7 @@ class Command:
     sensor_errors_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
     anomaly_weights: tuple[float, ...] = ()
     fit: float = 1.0
-    separation: Separation | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
 
     def __post_init__(self) -> None:
         if not _finite(vars(self).values()):

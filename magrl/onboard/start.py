@@ -246,8 +246,8 @@ FIX_SQUARE = 13.8
 """Normalized square of the deviation of a fix in two axes that right ones exceed with a probability of .001."""
 
 
-def fixed(states: State, fix: Fix) -> State:
-    """Return states ``(K, ...)`` after a fix of the position.
+def fixed(states: State, fix: Fix) -> tuple[State, Tensor]:
+    """Return states ``(K, ...)`` after a fix of the position, and its evidence ``(K,)``.
 
     Raises:
         ValueError: for a fix that does not fit the place that the first estimates.
@@ -261,6 +261,7 @@ def fixed(states: State, fix: Fix) -> State:
             "or state a larger std_km"
         )
     new = position_fix(states.beliefs, place, fix.std_km)
-    log_weight = reweighed(states.log_weight, new)
+    log_weight, evidence = reweighed(states.log_weight, new)
     mean, covariance, place = recentered(updated(states.beliefs, new), log_weight)
-    return states._replace(mean=mean, covariance=covariance, place=place.squeeze(-2), log_weight=log_weight)
+    states = states._replace(mean=mean, covariance=covariance, place=place.squeeze(-2), log_weight=log_weight)
+    return states, evidence

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from magrl.checks import check_type
 from magrl.files import write_atomically
 from magrl.onboard import integrity, limits
-from magrl.onboard.doubt import LOST_SURPRISE, Doubt
+from magrl.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.onboard.journal import Command, Destination, Fix, Journal, Options, Step, estimates_of
 from magrl.onboard.start import at_flight_altitude, at_rest, check_first_reading, fixed, known_at_start
 from magrl.pilot import Reading, Rules, Track, act, advanced, declaring, estimated, retargeted
@@ -149,7 +149,8 @@ class Onboard:
         self._steps: tuple[Step | Fix | Destination, ...] = ()
         self._commands: tuple[dict[str, Any], ...] = ()
         self._states: State | None = None  # by what is stated, and without relying on it
-        self._apart: integrity.Separation | None = None  # between them
+        self._evidence: Any = 0.0  # of these hypotheses
+        self._held: tuple[integrity.Hypothesis, ...] = ()
         self._last: Any = None  # the last elements
         self._doubt = Doubt()
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
@@ -255,7 +256,8 @@ class Onboard:
         states, rules = self._states, self._rules
         states = states if fix.hours is None else at_rest(rules, states, self.options.drift_km(fix.hours))
         better = std_km**2 < states.belief.covariance[0, PLACE, PLACE].trace().item()
-        self._states = fixed(states, fix)
+        self._states, evidence = fixed(states, fix)
+        self._evidence = self._evidence + evidence
         self._doubt = Doubt(hung=self._doubt.hung) if better else self._doubt
         self._steps += (fix,)
 
@@ -272,16 +274,17 @@ class Onboard:
         reading = self._reading(step, read, elements, course)
         with torch.inference_mode():
             if self._states is None:
-                states, surprise, tail = integrity.begun(self._rules, reading)
+                states, surprise, tail, evidence = integrity.begun(self._rules, reading)
                 check_first_reading(reading, tail[0].item())
                 self._flown = self._other and self._other.begun(self.options, reading)
             else:
-                states, surprise, tail = advanced(self._rules, self._states, reading)
+                states, surprise, tail, evidence = advanced(self._rules, self._states, reading)
             track = estimated(self._rules, reading, State(*(part[0] for part in states)), surprise[0], tail[0])
-            self._apart = integrity.separation(self._rules, states, reading)
+            self._evidence = self._evidence + evidence
             network, other = self._network, copy.copy(self._flown)
             action = other.act(reading) if other else act(self._rules, track, reading, network)
             action, decision = declaring(self._rules, track, reading, action)
+            self._held = integrity.hypotheses(self._rules, states, reading, self._evidence, decision.probability)
         if some and (reading.known is not None or self._states):
             doubt = doubt.after(track, first=self._states is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, step.elements, step.distance)
@@ -339,10 +342,10 @@ class Onboard:
         steer = math.degrees(course + turn) % 360.0
         north, east = track.displacement.mean.tolist()
         (nn, ne), (en, ee) = track.displacement.covariance.tolist()
-        estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), radius, stop, reason
+        estimates = (north, east), ((nn, ne), (en, ee)), integrity.probability(self._held), radius, stop, reason
         found = estimates_of(track.state, located=self._rules.start_km is not None)
         return Command(
-            distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, separation=self._apart, **found
+            distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, hypotheses=self._held, **found
         )
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
@@ -362,7 +365,9 @@ class Onboard:
             return None, ""
         if declare and decision.probability.item() >= options.confidence:
             probability = f"an estimated probability of {decision.probability.item():.2f}"
-            if text := integrity.objection(self._rules, doubt.fit, self._apart, track.state.crust_nt.item()):
+            if doubt.fit < LEAST_FIT:
+                return "nearest", f"{probability}, but readings do not fit what is stated (p = {doubt.fit:.1g})"
+            if text := integrity.objection(self._rules, self._held, track.state.crust_nt.item()):
                 return "nearest", f"{probability}, but {text}"
             return "arrived", f"within {options.radius_km:g} km with {probability}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"

@@ -117,16 +117,18 @@ def recentered(beliefs: Belief, log_weight: Tensor) -> Belief:
     return Belief(beliefs.mean - shift.unsqueeze(-2), beliefs.covariance, after.place.unsqueeze(-2))
 
 
-def reweighed(log_weight: Tensor, new: Innovation) -> Tensor:
-    """Return the logarithms ``(..., H)`` of the weights after a reading, and before the next, for which the
-    surroundings may change.
+def reweighed(log_weight: Tensor, new: Innovation) -> tuple[Tensor, Tensor]:
+    """Return the logarithms of the weights ``(..., H)`` after a reading, and before the next, for which the
+    surroundings may change; and of the evidence ``(...)``, the likelihood of the reading by all beliefs up to a factor.
 
     Args:
         log_weight: those before.
         new: innovation of each belief.
     """
-    after = torch.log_softmax(log_weight - (new.square() + torch.logdet(new.covariance)) / 2, -1)
-    return torch.logaddexp(after + math.log1p(-CHANGES), prior_weights(after) + math.log(CHANGES))
+    joint = log_weight - (new.square() + torch.logdet(new.covariance)) / 2
+    after = torch.log_softmax(joint, -1)
+    after = torch.logaddexp(after + math.log1p(-CHANGES), prior_weights(after) + math.log(CHANGES))
+    return after, torch.logsumexp(joint, -1)
 
 
 def tail(log_weight: Tensor, new: Innovation, count: Tensor) -> Tensor:

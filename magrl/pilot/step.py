@@ -71,7 +71,7 @@ def begin(rules: Rules, reading: Reading) -> Track:
         >>> begin(Rules(), Reading(here, torch.tensor([3.0, 66.0, 17500.0]), zero, zero, accuracy, zero)).aim.shape
         torch.Size([2])
     """
-    return estimated(rules, reading, *started(rules, reading))
+    return estimated(rules, reading, *started(rules, reading)[:3])
 
 
 def advance(rules: Rules, state: State, reading: Reading) -> Track:
@@ -80,11 +80,11 @@ def advance(rules: Rules, state: State, reading: Reading) -> Track:
     The stated noise is always scaled by what the readings show (``noise_estimate``), and a spike
     counts less (:func:`~magrl.pilot.spike_factor`).
     """
-    return estimated(rules, reading, *advanced(rules, state, reading))
+    return estimated(rules, reading, *advanced(rules, state, reading)[:3])
 
 
-def started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
-    """Return the state at the first reading, no surprise, and the tail probability of the reading."""
+def started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor, Tensor]:
+    """Return the state at the first reading, no surprise, and the tail probability and the evidence of the reading."""
     field, none = reading.field, torch.zeros_like(reading.field, dtype=torch.float64)
     beliefs = _first_beliefs(rules, reading)
     log_weight = anomalies.prior_weights(beliefs.mean[..., 0])
@@ -99,7 +99,7 @@ def started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
     after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new, _count(beliefs, seen))
     rest = quiet, quiet, unvisited_yet(field), weights, home[..., 0], home, _declination(after, reading), none[..., 0]
     state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *rest)
-    return _surveyed(rules, state, reading), none[..., 0], tail
+    return _surveyed(rules, state, reading), none[..., 0], tail, anomalies.reweighed(log_weight, new)[1]
 
 
 def _surveyed(rules: Rules, state: State, reading: Reading) -> State:
@@ -137,8 +137,9 @@ def _first_beliefs(rules: Rules, reading: Reading) -> Belief:
     return known(beliefs, *given, anomalies.sizes().to(beliefs.mean))
 
 
-def advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor, Tensor]:
-    """Return the state after a leg and the reading at its end, and the surprise and tail probability of that."""
+def advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor, Tensor, Tensor]:
+    """Return the state after a leg and the reading at its end, and the surprise, the tail probability and the evidence
+    of that."""
     one = _true(reading, state.north)
     seen, own = _side_by_side(one), NoiseEstimate(state.log_ratio, state.readings)
     std, heading, field = seen.std.noise, seen.heading, seen.field
@@ -151,7 +152,7 @@ def advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tenso
     wide = spike_factor(prediction.noisy(scaled), scaled)
     own = noise_estimate(own, prediction.noisy(scaled * wide), std * wide)
     new = prediction.noisy(std * own.factor * wide)
-    log_weight, count = anomalies.reweighed(state.log_weight, new), _count(beliefs, seen)
+    (log_weight, evidence), count = anomalies.reweighed(state.log_weight, new), _count(beliefs, seen)
     tail = anomalies.tail(state.log_weight, new, count)
     beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
     surprise = (state.log_weight.exp() * stated.square()).sum(-1) / count.squeeze(-1)
@@ -160,7 +161,7 @@ def advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tenso
     path, home, visited = state.path + reading.distance, state.home + leg, visit(state.visited, leg.to(state.visited))
     rest = visited, state.weights, path, home, _declination(after, reading), state.there
     state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *own, *rest)
-    return state, surprise, tail
+    return state, surprise, tail, evidence
 
 
 def _count(beliefs: Belief, seen: Reading) -> Tensor:

@@ -136,7 +136,8 @@ def test_a_fix_is_weighed_by_its_error() -> None:
     assert after.covariance[PLACE, PLACE].trace().item() == pytest.approx(1 / (1 / 36 + 1 / 9))
     vehicle = begun(start_km=6.0)
     prior = f64(*vehicle.step(*at(0.0), heading=0.0).place_covariance_km2)
-    expected = reweighed(vehicle._state.log_weight, position_fix(vehicle._state.beliefs, vehicle._state.place, 3.0))
+    new = position_fix(vehicle._state.beliefs, vehicle._state.place, 3.0)
+    expected = reweighed(vehicle._state.log_weight, new)[0]
     assert not torch.allclose(expected, vehicle._state.log_weight, atol=1e-3)
     vehicle.fix(*vehicle._state.place.tolist(), std_km=3.0)
     torch.testing.assert_close(vehicle._state.log_weight, expected)

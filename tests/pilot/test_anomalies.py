@@ -35,7 +35,7 @@ def weights(size: Tensor, drift: Tensor) -> Tensor:
         read = near - guess.residual[index, size]  # what the true belief predicts, and a draw of its own innovation
         read = read + (torch.linalg.cholesky(guess.covariance[index, size]) @ noise[leg].unsqueeze(-1)).squeeze(-1)
         new = innovation(beliefs, read.unsqueeze(1), std)
-        log_weight = anomalies.reweighed(log_weight, new)
+        log_weight = anomalies.reweighed(log_weight, new)[0]
         beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
     return log_weight.exp()
 
@@ -99,6 +99,6 @@ def test_a_vehicle_that_comes_to_another_field_finds_out() -> None:
     log_weight = anomalies.prior_weights(HERE)
     for square in (*[0.0] * 100, 36.0):
         residual = f64((square / 3) ** 0.5).expand(3, 3)
-        log_weight = anomalies.reweighed(log_weight, Innovation(residual, torch.ones(3, 3, STATES).double(), spread))
+        log_weight = anomalies.reweighed(log_weight, Innovation(residual, torch.ones(3, 3, STATES).double(), spread))[0]
         weights = log_weight.exp()
         assert weights[0] > 0.9 if not square else weights[1] > 0.9
