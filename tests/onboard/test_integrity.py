@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from support.tracks import f64
+from torch.distributions import MultivariateNormal
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
 from magrl.onboard import Command, Onboard
-from magrl.onboard.integrity import Separation, objection
+from magrl.onboard.integrity import NAMES, PRIOR, Hypothesis, objection
 from magrl.pilot import Rules
 from magrl.pilot.belief import PLACE
 from magrl.pilot.records import State
@@ -56,42 +58,56 @@ def test_each_estimate_is_that_of_a_vehicle_with_such_a_start_or_drift(index: in
         torch.testing.assert_close(value, other, rtol=1e-6, atol=1e-6, msg=name)
 
 
-def test_the_separation_is_normalized_by_the_difference_of_the_covariances() -> None:
-    """The probability without the drift is that of a sample."""
+def normal(vehicle: Onboard, index: int, there: tuple[float, float], std_km: float = 0.0) -> MultivariateNormal:
+    """Of the displacement from a place to the vehicle by a hypothesis."""
+    belief = part(vehicle._states, index).belief
+    distance, bearing = geodesic(*f64(*there), *belief.place)
+    mean = distance * torch.stack((bearing.cos(), bearing.sin()))
+    return MultivariateNormal(mean, belief.covariance[PLACE, PLACE] + std_km**2 / 2 * torch.eye(2))
+
+
+def test_the_arrival_by_a_hypothesis_is_that_of_a_sample() -> None:
     vehicle, commands = sailed(8, radius_km=30.0)
-    own, start, drift = (part(vehicle._states, index).belief for index in range(3))
-    distance, bearing = geodesic(*own.place, *start.place)
-    apart = distance * torch.stack((bearing.cos(), bearing.sin()))
-    spread = (start.covariance - own.covariance)[PLACE, PLACE]
-    assert commands[-1].separation is not None
-    assert commands[-1].separation.start == pytest.approx((apart @ spread.inverse() @ apart).item(), rel=1e-6)
-    distance, bearing = geodesic(*drift.place, *f64(*at(240.0)))
-    normal = torch.distributions.MultivariateNormal(
-        distance * torch.stack((bearing.cos(), bearing.sin())), drift.covariance[PLACE, PLACE]
-    )
     torch.manual_seed(0)
-    within = (normal.sample((100_000,)).norm(dim=-1) < 30).double().mean().item()
-    assert commands[-1].separation.drift == pytest.approx(within, abs=0.02)
-    assert 0.05 < within < 0.95
+    for index in (1, 2):
+        sample = normal(vehicle, index, at(240.0)).sample((100_000,))
+        within = (sample.norm(dim=-1) < 30).double().mean().item()
+        assert commands[-1].hypotheses[index].arrival == pytest.approx(within, abs=0.02)
+        assert 0.05 < within < 0.95
+    assert commands[-1].confidence == pytest.approx(sum(p * arrival for _, p, arrival in commands[-1].hypotheses))
+
+
+@pytest.mark.parametrize("off_km", [0.0, 8.0])
+def test_a_fix_weighs_a_hypothesis_by_its_density(off_km: float) -> None:
+    vehicle = sailed(3)[0]
+    expected = [normal(vehicle, index, at(60.0 + off_km), 3.0).log_prob(f64(0.0, 0.0)).item() for index in range(3)]
+    before = vehicle._evidence.clone()
+    vehicle.fix(*at(60.0 + off_km), 3.0)
+    found = (vehicle._evidence - before).tolist()
+    assert [x - found[0] for x in found] == pytest.approx([x - expected[0] for x in expected], abs=0.1)
+    last = vehicle.step(*[None] * 3, heading=0.0, distance=0.0).hypotheses
+    ratio = [one.probability / PRIOR[k] for k, one in enumerate(last)]
+    assert ratio[1] / ratio[0] == pytest.approx(math.exp(vehicle._evidence[1] - vehicle._evidence[0]))
 
 
 def test_a_start_that_is_not_as_stated_is_no_arrival() -> None:
     """Without integrity, the vehicle says that it has arrived."""
     flights = sailed(9, 80.0, integrity=False)[1], sailed(9, 80.0)[1], sailed(9)[1]
     assert [commands[-1].stop for commands in flights] == ["arrived", "nearest", "arrived"]
-    assert flights[0][-1].separation is None
-    assert "1.00, but without the stated start, the place is 4.2 standard errors away" in flights[1][-1].reason
+    assert [len(commands[-1].hypotheses) for commands in flights] == [1, 3, 3]
+    assert "1.00, but 0.00 by a start to 100 km, whose own probability is " in flights[1][-1].reason
 
 
-def test_objections() -> None:
+def test_anomalies_are_an_objection_without_a_known_start_alone() -> None:
+    certain = [Hypothesis(name, 1.0, 1.0) for name in NAMES]
     rules, usual = Rules(integrity=True), Rules()
-    assert objection(rules, 0.03, Separation(0.0, 1.0), 0.0) == "readings do not fit what is stated (p = 0.03)"
-    assert objection(usual, 0.03, None, 90.0) == ""
-    assert objection(usual, 0.003, None, 0.0) == "readings do not fit what is stated (p = 0.003)"
-    assert objection(rules, 1.0, Separation(6.7, 1.0), 0.0).startswith("without the stated start")
-    assert objection(rules, 1.0, Separation(6.5, 0.4), 0.0) == "it is 0.40 with a drift of 0.1"
-    assert objection(rules, 1.0, Separation(6.5, 0.6), 90.0) == ""
-    assert objection(rules, 1.0, None, 29.0) == ""
+    assert objection(rules, certain[:1], 31.0).startswith("anomalies of 31 nT are expected, of at most 30")
+    assert (
+        objection(rules, certain[:1], 29.0)
+        == objection(rules, certain, 90.0)
+        == objection(usual, certain[:1], 90.0)
+        == ""
+    )
 
 
 def test_a_flight_is_restored_to_the_bit(tmp_path: Path) -> None:
@@ -106,10 +122,10 @@ def test_a_flight_is_restored_to_the_bit(tmp_path: Path) -> None:
         Onboard("kalman", sensor_std=STD, drift=0.03).restore(tmp_path / "flight.json")
 
 
-def test_separation_is_none_without_a_known_start() -> None:
+def test_there_is_one_hypothesis_without_a_known_start() -> None:
     vehicle = Onboard("kalman", sensor_std=STD, integrity=True)
     vehicle.start((-23.0, -63.0, 12000.0), target_std=(0.0, 0.0, 0.0))
-    assert vehicle.step(-24.0, -64.0, 11900.0, heading=0.0).separation is None
+    assert vehicle.step(-24.0, -64.0, 11900.0, heading=0.0).hypotheses[1:] == ()
 
 
 def test_a_simulated_vehicle_has_none() -> None:
