@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import cache
 
 import numpy as np
@@ -33,6 +34,19 @@ def test_a_right_sheet_and_a_spike_cost_no_flight(row: str) -> None:
 def test_a_wrong_sheet_is_no_false_arrival() -> None:
     false = {row: sum(flight.outcome == OUTCOMES[2] for flight in flights(row)) for row in BROKEN}
     assert sum(false.values()) <= (1 - CONFIDENCE) * FLIGHTS * len(BROKEN), false
+
+
+@pytest.mark.slow
+def test_integrity_makes_false_arrivals_rare() -> None:
+    """Of those from a wrong start and in a storm; arrivals of a right sheet stay."""
+    ends = {
+        (row, integrity): Counter(flown(ROWS[row], "ship", k, SEED, integrity=integrity).outcome for k in range(24))
+        for row in ("start-100-km", "storm-on-path", "right")
+        for integrity in (False, True)
+    }
+    false = [sum(counts["false"] for (_, on), counts in ends.items() if on == integrity) for integrity in (False, True)]
+    assert false[1] < false[0] / 2
+    assert ends["right", True]["arrived"] >= 18
 
 
 def test_the_field_is_that_of_ppigrf_and_a_crust_the_gradient_of_a_potential() -> None:
