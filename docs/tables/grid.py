@@ -24,6 +24,7 @@ from magrl.evaluation import Sheet
 from magrl.evaluation.tables import markdown_table
 from magrl.evaluation.tracks import COLUMNS, episode_table, write_episodes
 from magrl.files import check_writable, read_document, read_text, write_text
+from magrl.jobs import Backend, mapped
 from magrl.navigators.names import check_distinct
 from magrl.training import UsageError, command
 
@@ -32,7 +33,6 @@ from pandas import read_csv
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
 from flights import ABOUT, MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of, titles_of
-from workers import Backend, mapped
 
 from evaluate import Config, evaluate
 
@@ -47,6 +47,7 @@ def flights(
     measures: Sequence[str] = MEASURES,
     jobs: int = 1,
     backend: Backend = "loky",
+    address: str | None = None,
     device: str = "cpu",
     **options: Any,
 ) -> Table:
@@ -61,9 +62,8 @@ def flights(
     region = made.scenario.trips.region
     known = [names(navigator, made.sheet) for navigator in navigators]
     titles = titles_of(ABOUT, known)
-    cells = mapped(
-        partial(episodes_of, options, device), list(itertools.product(navigators, made.errors)), jobs, backend
-    )
+    pairs = list(itertools.product(navigators, made.errors))
+    cells = mapped(partial(episodes_of, options, device), pairs, jobs, backend, address)
     for name, about_it in zip(titles, known, strict=True):
         episodes = {level: next(cells) for level in made.errors}
         shares[name] = [runs[0][share].double() for runs in episodes.values()]
@@ -112,6 +112,7 @@ def make(
     confidence: float | None = None,
     jobs: int | None = None,
     backend: Backend | None = None,
+    address: str | None = None,
     device: str | None = None,
     out: Path | None = None,
 ) -> None:
@@ -124,6 +125,7 @@ def make(
         confidence: Minimum probability at which vehicles declare their arrival; by default from tables.toml.
         jobs: Processes that fly, with one thread each; of tables of the kind flights.
         backend: Where they are: loky on this machine, ray on a cluster.
+        address: Cluster of Ray, auto or HOST:PORT; by default one is started on this machine.
         device: Device of the flights: cpu, cuda, cuda:0, ...
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 
@@ -131,7 +133,7 @@ def make(
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
     specs, changes = declared(), {"navigators": navigators, "trips": trips, "confidence": confidence}
-    changes |= {"jobs": jobs, "backend": backend, "device": device}
+    changes |= {"jobs": jobs, "backend": backend, "address": address, "device": device}
     changes = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in tables if name not in specs]:
         raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(specs)}")

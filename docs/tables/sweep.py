@@ -38,9 +38,9 @@ from magrl.envs.measures import interquartile_mean, stratified_bootstrap
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
+from magrl.jobs import Backend, mapped
 from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.training import UsageError, command
-from workers import Backend, mapped
 
 import numpy as np
 import torch
@@ -105,6 +105,8 @@ class Config:
     """Runs at a time, with one thread each."""
     backend: Backend = "loky"
     """Where they run: loky on this machine, ray on a cluster with a common folder."""
+    address: str | None = None
+    """Cluster of Ray, auto or HOST:PORT; by default one is started on this machine."""
     train: bool = True
     """Whether to train what is missing."""
     out: Path = Path("runs/sweep")
@@ -265,7 +267,7 @@ def main(args: Sequence[str] | None = None) -> None:
     if config.train:
         os.environ["OMP_NUM_THREADS"] = "1"
         with locked(config.out):
-            list(mapped(partial(run, config), jobs, config.jobs, config.backend, "run"))
+            list(mapped(partial(run, config), jobs, config.jobs, config.backend, config.address, "run"))
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
     if not paths:
         raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
