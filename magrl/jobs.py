@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import socket
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Literal
 
 import torch
 
-from magrl.checks import library
+from magrl.checks import check_choice, check_number, library
 
 Backend = Literal["loky", "ray"]
 """Where jobs run."""
@@ -24,34 +31,119 @@ def mapped(
 ) -> Iterator[Any]:
     """Yield the results of a function in the order of its values, with a progress bar.
 
+    When the iterator ends or is closed, by Ctrl-C too, all processes have ended.
+
     Args:
         function: function of one value.
         values: the values.
-        jobs: processes at a time, with one thread each; 1 for this process.
-        backend: where they are: ``"loky"`` for this machine, ``"ray"`` for a cluster.
+        jobs: calls at a time, each with one thread; a single one of ``"loky"`` runs in this process.
+        backend: where they run: ``"loky"`` on this machine, ``"ray"`` on a cluster.
         address: cluster of Ray, ``"auto"`` or ``"HOST:PORT"``; None starts one on this machine.
         unit: name of a value.
+
+    Raises:
+        ChildProcessError: with the value whose process was killed.
+        ConnectionError: if there is no cluster at the address.
+        ImportError: with the command that installs what is missing.
 
     Example:
         >>> list(mapped(abs, [-1, 2]))
         [1, 2]
     """
+    check_choice(_BACKENDS, backend=backend)
+    check_number(1, whole=True, jobs=jobs)
     bar = partial(library("tqdm", "recipes").tqdm, total=len(values), unit=unit)
-    if jobs == 1:
-        yield from bar(map(function, values))
+    if jobs == 1 and backend == "loky":
+        yield from bar(map(partial(_alone, function), values))
         return
-    if backend == "ray":
-        ray = library("ray", "ray")
-        ray.init(address or "local", ignore_reinit_error=True)
-        with library("ray.util.multiprocessing", "ray").Pool(jobs) as pool:
-            yield from bar(pool.imap(partial(_alone, function), values))
-        return
-    joblib = library("joblib", "recipes")
-    with joblib.parallel_config(backend):
-        calls = (joblib.delayed(_alone)(function, value) for value in values)
-        yield from bar(joblib.Parallel(jobs, return_as="generator")(calls))
+    with _BACKENDS[backend](jobs, address) as (submit, killed):
+        yield from bar(_ordered(partial(submit, function), values, jobs, killed, unit))
+
+
+def _ordered(
+    submit: Callable[[Any], Future], values: Sequence[Any], jobs: int, killed: Any, unit: str
+) -> Iterator[Any]:
+    futures: list[Future] = []
+    for number, value in enumerate(values):
+        while number == len(futures) or not futures[number].done():
+            running = [future for future in futures if not future.done()]
+            if len(running) < jobs and len(futures) < len(values):
+                futures.append(submit(values[len(futures)]))
+            else:
+                wait([futures[number], *running], return_when=FIRST_COMPLETED)
+        try:
+            yield futures[number].result()
+        except killed as error:
+            if cause := getattr(error, "cause", None):  # Ray's error of the function
+                raise cause from None
+            raise ChildProcessError(f"the process of {unit} {value!r} was killed, maybe out of memory") from error
 
 
 def _alone(function: Callable[[Any], Any], value: Any) -> Any:
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    return function(value)
+    try:
+        return function(value)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def _loky(*_: Any) -> Iterator[tuple[Callable[..., Future], Any]]:
+    """Executors of one process each, so that a process that is killed is known by its value."""
+    loky = library("joblib.externals.loky", "recipes")
+    last, groups = dict[Any, Future](), dict[Any, Future]()
+
+    def submit(*call: Any) -> Future:
+        idle = [executor for executor, future in last.items() if future.done() and not future.exception()]
+        executor = idle[0] if idle else loky.ProcessPoolExecutor(1, initializer=_follow, initargs=(os.getpid(),))
+        groups[executor] = executor.submit(os.getpid)
+        last[executor] = executor.submit(_alone, *call)
+        return last[executor]
+
+    try:
+        yield submit, loky.process_executor.TerminatedWorkerError
+    finally:
+        for executor, group in groups.items():
+            with suppress(Exception):  # that has not begun, or has ended
+                os.killpg(group.result(0), signal.SIGKILL)  # also what a killed process has started
+            executor.shutdown(kill_workers=True)
+
+
+def _follow(parent: int) -> None:
+    """Kill this process, and those that it starts, soon after its parent has ended."""
+    os.setpgrp()  # out of reach of Ctrl-C, which the parent handles
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os.killpg(0, signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _ray(jobs: int, address: str | None) -> Iterator[tuple[Callable[..., Future], Any]]:
+    ray = library("ray", "ray")
+    if address and ":" in address:  # Ray would wait for minutes
+        try:
+            socket.create_connection(tuple(address.rsplit(":", 1)), 10).close()  # type: ignore[arg-type]
+        except OSError as error:
+            raise ConnectionError(f"no Ray cluster is at {address} ({error}): start it by ray start --head") from error
+    # Without an address, Ray would wait for the cluster of a file that is left where one was killed.
+    ray.init(address or "local", num_cpus=None if address else jobs, include_dashboard=False, log_to_driver=False)
+    task, refs = ray.remote(max_retries=0)(_alone), []
+
+    def submit(*call: Any) -> Future:
+        refs.append(task.remote(*call))
+        return refs[-1].future()
+
+    try:
+        yield submit, ray.exceptions.RayError
+    finally:
+        for ref in refs:  # at once: a shutdown takes seconds
+            ray.cancel(ref, force=True)
+        ray.shutdown()
+
+
+_BACKENDS = {"loky": _loky, "ray": _ray}

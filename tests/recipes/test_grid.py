@@ -1,6 +1,8 @@
 """Tables and figures from their declarative files: flights and cells by hand, and files that are named."""
 
+import time
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +18,7 @@ from tensordict import TensorDict
 
 from magrl.evaluation import tracks
 from magrl.evaluation.tracks import COLUMNS, LEVELS, read_episodes
+from magrl.jobs import mapped
 from magrl.training import UsageError
 
 
@@ -104,6 +107,29 @@ def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
     assert rows(grid.flights([oracle], **options, max_steps=1).text)[2][5] == "0.0 / 0.0"
     far = rows(grid.flights([oracle], **options, distance_km=(1200, 1300), max_steps=30).text)
     assert far[2][5] == "100.0 / 100.0"
+
+
+@pytest.mark.slow
+def test_a_table_of_a_cluster_is_that_of_processes(monkeypatch) -> None:
+    """On two nodes of one processor each."""
+    monkeypatch.setenv("PYTHONWARNINGS", "ignore")
+    cluster = pytest.importorskip("ray.cluster_utils").Cluster(True, head_node_args={"num_cpus": 1})
+    cluster.add_node(num_cpus=1)
+    options = {"levels": [(0, 0, 0), (0.5, 0.1, 20)], "jobs": 2} | NEAR
+    try:
+        assert len(set(mapped(node, range(4), 2, "ray", cluster.address))) == 2
+        far = grid.flights(["secant", "kalman"], **options, backend="ray", address=cluster.address)
+    finally:
+        cluster.shutdown()
+    near = grid.flights(["secant", "kalman"], **options)
+    assert far.text == near.text
+    for one, other in zip(far.episodes, near.episodes, strict=True):
+        assert one.equals(other)
+
+
+def node(_: int) -> str:
+    time.sleep(1)  # so that one node does not do all
+    return import_module("ray").get_runtime_context().get_node_id()
 
 
 def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, monkeypatch) -> None:
