@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -131,7 +132,9 @@ def _ray(jobs: int, address: str | None) -> Iterator[tuple[Callable[..., Future]
         except OSError as error:
             raise ConnectionError(f"no Ray cluster is at {address} ({error}): start it by ray start --head") from error
     # Without an address, Ray would wait for the cluster of a file that is left where one was killed.
-    ray.init(address or "local", num_cpus=None if address else jobs, include_dashboard=False, log_to_driver=False)
+    options = {} if address else {"num_cpus": jobs, "include_dashboard": False}
+    environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}  # modules beside a script or a test
+    ray.init(address or "local", runtime_env=environment, log_to_driver=False, **options)
     task, refs = ray.remote(max_retries=0)(_alone), []
 
     def submit(*call: Any) -> Future:

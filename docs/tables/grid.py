@@ -63,7 +63,7 @@ def flights(
     known = [names(navigator, made.sheet) for navigator in navigators]
     titles = titles_of(ABOUT, known)
     pairs = list(itertools.product(navigators, made.errors))
-    cells = mapped(partial(episodes_of, options, device), pairs, jobs, backend, address)
+    cells = iter(list(mapped(partial(episodes_of, options, device), pairs, jobs, backend, address)))
     for name, about_it in zip(titles, known, strict=True):
         episodes = {level: next(cells) for level in made.errors}
         shares[name] = [runs[0][share].double() for runs in episodes.values()]

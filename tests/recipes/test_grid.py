@@ -1,5 +1,6 @@
 """Tables and figures from their declarative files: flights and cells by hand, and files that are named."""
 
+import tempfile
 import time
 from dataclasses import replace
 from importlib import import_module
@@ -112,7 +113,8 @@ def test_a_table_has_a_row_for_each_navigator_and_difference() -> None:
 @pytest.mark.slow
 def test_a_table_of_a_cluster_is_that_of_processes(monkeypatch) -> None:
     """On two nodes of one processor each."""
-    monkeypatch.setenv("PYTHONWARNINGS", "ignore")
+    folder = tempfile.TemporaryDirectory(dir="/tmp", ignore_cleanup_errors=True)  # names of sockets must be short
+    monkeypatch.setenv("RAY_TMPDIR", folder.name)
     cluster = pytest.importorskip("ray.cluster_utils").Cluster(True, head_node_args={"num_cpus": 1})
     cluster.add_node(num_cpus=1)
     options = {"levels": [(0, 0, 0), (0.5, 0.1, 20)], "jobs": 2} | NEAR
@@ -121,6 +123,7 @@ def test_a_table_of_a_cluster_is_that_of_processes(monkeypatch) -> None:
         far = grid.flights(["secant", "kalman"], **options, backend="ray", address=cluster.address)
     finally:
         cluster.shutdown()
+        folder.cleanup()
     near = grid.flights(["secant", "kalman"], **options)
     assert far.text == near.text
     for one, other in zip(far.episodes, near.episodes, strict=True):
