@@ -14,16 +14,16 @@ import csv
 import json
 from collections import namedtuple
 from collections.abc import Iterable, Iterator, Sequence
-from functools import cache
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
 from geographiclib.geodesic import Geodesic
-from joblib import Parallel, delayed
 from ppigrf import igrf
 from scipy.interpolate import RectBivariateSpline
 
 from magrl.errors import CONDITIONS, Conditions
+from magrl.jobs import mapped
 from magrl.onboard import Onboard
 
 CONFIDENCE, RADIUS_KM, START_KM = 0.8, 25.0, 5.0
@@ -236,6 +236,10 @@ def table(flights: Sequence[Flight]) -> Iterator[str]:
         yield "| " + " | ".join(map(str, values)) + " |"
 
 
+def called(options: dict[str, object], call: Sequence) -> Flight:
+    return flown(*call, **options)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, default in {"flights": 120, "seed": 1, "jobs": 1, "confidence": CONFIDENCE, "out": "flights.csv"}.items():
@@ -249,8 +253,8 @@ def main() -> None:
     options = {name: json.loads(value) for name, value in (text.split("=") for text in texts)}
     with open(args.out, "w", newline="", encoding="utf-8", buffering=1) as file:
         csv.writer(file).writerow(Flight._fields)
-        calls = product(rows, args.vehicle, range(args.flights), [args.seed])
-        for flight in Parallel(args.jobs, return_as="generator")(delayed(flown)(*x, **options) for x in calls):
+        calls = list(product(rows, args.vehicle, range(args.flights), [args.seed]))
+        for flight in mapped(partial(called, options), calls, args.jobs, unit="flight"):
             csv.writer(file).writerow(flight)
             flights.append(flight)
     print(*table(flights), sep="\n")
