@@ -81,6 +81,8 @@ class Config(rule_settings("zeta", "arrival", "radius_km", "max_leg_km", "max_tu
 
     preset: Literal[*TABLES] = "far"  # type: ignore[valid-type]
     """Source of the defaults: destinations 150-1800 km away, or 300-500 km."""
+    task: Literal["anywhere"] = "anywhere"
+    """Named task (docs/tasks.md)."""
 
     # Own defaults of shared settings
     total_frames: Count = 2_621_440

@@ -1,29 +1,35 @@
-"""stable-baselines3 on the navigation environment: PPO, SAC or TD3, with many vehicles in one batch.
+"""stable-baselines3 on the named tasks: PPO, SAC or TD3, with many vehicles in one batch.
 
-    pip install -c constraints.txt -e '.[recipes,sb3]'
-    python docs/examples/sb3.py                       # PPO, 330 000 steps
-    python docs/examples/sb3.py --algorithm sac --num-envs 64 --total-timesteps 51200
+    pip install -c constraints.txt -e '.[recipes,onnx,sb3]'
+    python docs/examples/sb3.py                       # PPO on Box, 330 000 steps: one to two minutes
+    python docs/examples/sb3.py --algorithm sac --task eddies --num-envs 64 --total-timesteps 50000
+    python recipes/sweep.py --command PPO='python docs/examples/sb3.py' -- --task box    # five seeds
 
-Prints success rate, SPL (success weighted by path length) and steps on 100 test trips. Takes one to two minutes.
+Prints the score (magrl.score), and writes the agent, policy.onnx, and its learning curve, train.csv.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
-from magrl import Scenario
-from magrl.envs.gymnasium import ENV_ID
+from magrl import score
+from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.sb3 import BatchedVecEnv
-from magrl.random_numbers import TEST_SEED
 
-import gymnasium
 import numpy as np
+import torch
 import tyro
+from pandas import DataFrame
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecMonitor
+from torch import Tensor, nn
+
+POINTS = 10
+"""Points of the learning curve."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,8 @@ class Config:
 
     algorithm: Literal["ppo", "sac", "td3"] = "ppo"
     """Algorithm of stable-baselines3."""
+    task: str = "box"
+    """Named task (docs/tasks.md)."""
     num_envs: int = 256
     """Number of vehicles."""
     total_timesteps: int = 327_680
@@ -42,15 +50,17 @@ class Config:
     """Gradient steps after each step of all vehicles, of SAC and TD3."""
     learning_rate: float = 1e-3
     """Learning rate of Adam."""
-    eval_trips: int = 100
-    """Number of test trips of the final evaluation."""
+    episodes: int = 200
+    """Episodes of each score."""
     seed: int = 0
     """Random seed of weights, exploration and trips."""
+    out: Path = Path("runs/sb3")
+    """Folder of agent and learning curve."""
 
 
 def make_model(config: Config) -> BaseAlgorithm:
     """Return an agent, with the networks and discount of the recipes' preset `fast` for SAC and TD3."""
-    envs = VecMonitor(BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=config.num_envs, autoreset_mode="SameStep")))
+    envs = BatchedVecEnv(GeomagneticNavVectorEnv(config.num_envs, task=config.task, autoreset_mode="SameStep"))
     settings: dict[str, Any] = {"learning_rate": config.learning_rate, "seed": config.seed, "device": "cpu"}
     if config.algorithm == "ppo":
         network = {"net_arch": [64, 64], "log_std_init": -0.5}
@@ -70,30 +80,55 @@ def make_model(config: Config) -> BaseAlgorithm:
     return {"sac": SAC, "td3": TD3}[config.algorithm]("MlpPolicy", envs, **settings)
 
 
-def evaluate(model: BaseAlgorithm, num_trips: int) -> dict[str, float]:
-    """Evaluate an agent on frozen test trips, all in one batch; return the means of their measures."""
-    scenario = Scenario()
-    scenario = scenario.with_trips(scenario.random_trips(num_trips, TEST_SEED))
-    envs = gymnasium.make_vec(ENV_ID, num_envs=num_trips, scenario=scenario)
-    observations, _ = envs.reset(seed=0)
-    first = {name: np.full(num_trips, np.nan) for name in ("success", "spl", "steps")}
-    while np.isnan(first["success"]).any():
-        actions, _ = model.predict(observations, deterministic=True)
-        observations, *_, info = envs.step(actions)
-        if info:
-            new = info["_success"] & np.isnan(first["success"])
-            for name, values in first.items():
-                values[new] = info[name][new]
-    return {name: float(values.mean()) for name, values in first.items()}
+class Curve(BaseCallback):
+    """Score the agent at :data:`POINTS` numbers of steps, and write the curve."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config, self.rows = config, list[dict[str, float]]()
+
+    def point(self) -> dict[str, float]:
+        """Add a point; return the score."""
+        scores = score(self.model, self.config.task, episodes=self.config.episodes)
+        self.rows.append({"frames": self.num_timesteps, "eval_success_rate": scores["SR"], "eval_spl": scores["SPL"]})
+        DataFrame(self.rows).to_csv(self.config.out / "train.csv", index=False)
+        return scores
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= len(self.rows) * self.config.total_timesteps / POINTS:
+            self.point()
+        return True
+
+
+class Acting(nn.Module):
+    """What a policy of stable-baselines3 does without exploration."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the action."""
+        return self.policy._predict(observation, deterministic=True)
+
+
+def save_agent(path: Path, policy: Any) -> None:
+    """Write a policy of stable-baselines3 with vectors as observations as ONNX, for :func:`magrl.score`."""
+    names = {"input_names": ["observation"], "output_names": ["action"]}
+    observations, size = torch.zeros(2, *policy.observation_space.shape), {0: torch.export.Dim("N")}
+    shapes = {"dynamic_shapes": {"observation": size}, "external_data": False}
+    torch.onnx.export(Acting(policy).eval(), (observations,), path, dynamo=True, verbose=False, **names, **shapes)
 
 
 def main(config: Config) -> dict[str, float]:
-    """Train and evaluate."""
-    model = make_model(config)
-    model.learn(config.total_timesteps)
-    result = evaluate(model, config.eval_trips)
-    print(", ".join(f"{name} {value:.3f}" for name, value in result.items()))
-    return result
+    """Train, score and save."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    model, curve = make_model(config), Curve(config)
+    model.learn(config.total_timesteps, callback=curve)
+    scores = curve.point()  # after the last update
+    save_agent(config.out / "policy.onnx", model.policy)
+    print(", ".join(f"{name} {value:.2f}" for name, value in scores.items()))
+    return scores
 
 
 if __name__ == "__main__":

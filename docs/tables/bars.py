@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,7 +54,6 @@ BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around th
 class Shown(NamedTuple):
     """What tables and figures show of a named task, as tasks.toml explains."""
 
-    budget: Mapping[str, float] = {"PPO": 500}
     reference: str = "kalman"
     bars: Sequence[str] = ("geodesic",)
     picture: Sequence[Any] = ("kalman", 0)

@@ -49,13 +49,14 @@ def known_values(values: Iterable[float | None]) -> list[float]:
     return [value for value in values if value is not None and math.isfinite(value)]
 
 
-def mean_of_runs(values: Iterable[float | None], *, form: str, interval: bool = True) -> str:
-    """Return the interquartile mean over runs with its interval, or with the range of fewer than ten runs.
+def mean_of_runs(values: Iterable[float | None], *, form: str, interval: bool = True, least: int = MIN_RUNS) -> str:
+    """Return the interquartile mean over runs with its interval, or with the range of few runs.
 
     Args:
         values: value of each run; NaN or None where a run has none.
         form: number format.
         interval: whether interval or range are shown.
+        least: number of runs from which on the interval is shown; by default ten.
 
     Example:
         >>> mean_of_runs([98.0, 99.0, 99.0, 100.0, None], form=".1f"), mean_of_runs([99.0] * 10, form=".0f")
@@ -69,7 +70,7 @@ def mean_of_runs(values: Iterable[float | None], *, form: str, interval: bool = 
     text = format(interquartile_mean(runs).item(), form)
     if len(runs) == 1 or not interval:
         return text
-    if len(runs) < MIN_RUNS:
+    if len(runs) < least:
         return f"{text} [{runs.min():{form}}–{runs.max():{form}}]"
     low, high = stratified_bootstrap([runs])
     return f"{text} ({low:{form}}–{high:{form}})"

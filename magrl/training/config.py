@@ -70,7 +70,7 @@ class RunConfig(CheckedModel):
     wandb_entity: str = ""
     """User or team of wandb; by default from the login."""
     wandb_group: str = ""
-    """Group of runs in wandb; the name of the run without its seed by default."""
+    """Group of runs in wandb; by default WANDB_RUN_GROUP, or the name of the run without its seed."""
     wandb_tags: tuple[str, ...] = ()
     """Tags of the run in wandb."""
     log_every: Count = 5

@@ -21,7 +21,9 @@ from magrl.files import append, write_json, write_text, write_with
 from magrl.training.wandb_run import WandbRun
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 OpenLog = Callable[..., WandbRun]
 COUNTS = ("frames", "episodes", "iterations", "updates")
@@ -269,3 +271,26 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
         axes.set_xlabel("frames (vehicle-steps)")
         axes.xaxis.set_major_formatter(library("matplotlib.ticker", "plots").EngFormatter(sep=""))
     return figure
+
+
+def draw_seeds(axes: Axes, runs: DataFrame, along: str, value: str, **look: Any) -> None:
+    """Draw the learning curve of several seeds: their median, and a band from the least to the highest.
+
+    Args:
+        axes: axes of matplotlib.
+        runs: points of the curves, with a column ``seed``; the n-th points of the seeds belong together.
+        along: column of the horizontal axis.
+        value: column of the vertical axis.
+        look: options of ``axes.plot``, with ``color``.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from pandas import DataFrame
+        >>> runs = DataFrame({"seed": [0, 1, 2], "frames": 512, "eval_spl": [90.0, 99.0, 94.0]})
+        >>> draw_seeds(axes := Figure().subplots(), runs, "frames", "eval_spl", color="C0")
+        >>> axes.lines[0].get_xydata().tolist()
+        [[512.0, 94.0]]
+    """
+    points = runs.groupby(runs.groupby("seed").cumcount())
+    axes.plot(place := points[along].median(), points[value].median(), **look)
+    axes.fill_between(place, points[value].min(), points[value].max(), color=look["color"], alpha=0.2, lw=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import shutil
 import signal
 import sys
@@ -252,7 +253,8 @@ class Run:
         columns += tuple(f"eval_{key}" for key in EVALUATED)
         entity, group, tags = (getattr(self.config, name) for name in WANDB_OPTIONS)
         opened = self.folder, self.config.wandb_mode, self.settings
-        labeled = partial(WandbRun, *opened, group=group or self.name, tags=(self.name, *tags), entity=entity)
+        group = group or os.environ.get("WANDB_RUN_GROUP", self.name)
+        labeled = partial(WandbRun, *opened, group=group, tags=(self.name, *tags), entity=entity)
         return RunLog(self.folder, columns, labeled, resumed=resumed, began=self._began)
 
     @property

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from pandas import DataFrame
 from support.recipes import load
 from torchrl.envs import Compose, TransformedEnv
 
 import magrl
+from magrl import score
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, geomagnetic, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
 from magrl.errors import SensorErrors
@@ -358,13 +361,26 @@ def test_checkers_find_nothing() -> None:
 
 
 def test_stable_baselines3_example(tmp_path: Path, monkeypatch) -> None:
+    """It leaves its curve, and an agent that has the score of its model."""
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
     example = load("docs/examples/sb3")
-    small = {"num_envs": 8, "total_timesteps": 80, "learning_starts": 60, "gradient_steps": 1, "eval_trips": 4}
-    result = example.main(example.Config("sac", **small))
-    assert result.keys() == {"success", "spl", "steps"}
-    assert 1 <= result["steps"] <= 50
+    monkeypatch.setattr(example, "POINTS", 2)
+    monkeypatch.setattr(example, "score", partial(score, max_steps=5))
+    small = {"num_envs": 8, "total_timesteps": 80, "learning_starts": 60, "gradient_steps": 1, "episodes": 4}
+    run = tmp_path / "nogo-SAC-seed0"
+    result = example.main(example.Config("sac", "nogo", **small, out=run))
+    load("docs/tables/agents").keep_agents(
+        [(("nogo", "SAC"), DataFrame({"seed": [0], "SPL": [1]}))], tmp_path, tmp_path
+    )
+    assert b"docs/examples" in (run / "policy.onnx").read_bytes()
+    assert b"docs/examples" not in (tmp_path / "nogo-SAC.onnx").read_bytes()
+    for path in (run / "policy.onnx", tmp_path / "nogo-SAC.onnx"):
+        saved = score(path, "nogo", episodes=4, max_steps=5)
+        assert result["return"] == pytest.approx(saved["return"], abs=1e-4)
+    head, *rows = (run / "train.csv").read_text("utf-8").split()
+    assert head == "frames,eval_success_rate,eval_spl"
+    assert [int(row.split(",")[0]) for row in rows] == [8, 40, 80, 80]
+    assert float(rows[-1].split(",")[2]) == result["SPL"]
 
 
 def test_batched_environment_under_stable_baselines3() -> None:

@@ -90,6 +90,7 @@ ADDITIONS = (
     "a vehicle",
     "a transform",
     "a table",
+    "an algorithm in the scores",
     "a figure",
     "an option of what is known",
     "a measure",

@@ -1,124 +1,194 @@
-"""The sweep of algorithms over the named tasks, and its bars."""
+"""Sweeps: seeds of recipes and of any command, their scores and curves."""
 
 from __future__ import annotations
 
-import math
-import runpy
-import sys
-from functools import partial
+import json
 from pathlib import Path
 
 import pytest
 import torch
-from pandas import read_csv
-from support.recipes import ROOT, TABLES, load
-from tensordict import TensorDict
+from pandas import DataFrame, read_csv
+from support.recipes import ROOT, load
 
 from magrl import score
+from magrl.envs.measures import interquartile_mean, stratified_bootstrap
 from magrl.files import locked
-from magrl.navigators import Secant
 from magrl.training import UsageError
 
-pytest.importorskip("stable_baselines3")
-sweep = load("docs/tables/sweep")
-bars = sys.modules["bars"]
-RESULTS = ROOT / "docs" / "results"
+sweep = load("recipes/sweep")
+PRETRAINED = ROOT / "magrl" / "navigators" / "pretrained"
+SCRIPT = f"""
+import json, os, shutil, sys
+from pathlib import Path
+given = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+resumed = "--resume" in given
+out = Path(given.get("--out") or given["--resume"])
+left = sorted(path.name for path in out.iterdir()) if out.exists() else []
+names = "OMP_NUM_THREADS", "WANDB_RUN_GROUP"
+calls = Path("calls.jsonl").open("a", encoding="utf-8")
+print(json.dumps([given, left, *map(os.environ.get, names)]), file=calls)
+out.mkdir(exist_ok=True)
+seed = given.get("--seed", "5")
+if seed == "5" and not resumed:  # a run of magrl.training.Run, which is interrupted
+    (out / "config.json").write_text('{{"recipe": "mine.py"}}')
+    sys.exit(130)
+if seed == "6" and not Path("again").exists():  # another one, which fails late
+    (out / "config.json").write_text('{{"mine": 1}}')
+    Path("again").touch()
+    print("Traceback\\nValueError: no luck", file=sys.stderr)
+    sys.exit(1)
+if seed != "7":
+    agent = "eddies" if seed == "0" else "memory"
+    shutil.copy(f"{PRETRAINED}/{{agent}}.safetensors", out / "policy.safetensors")
+(out / "train.csv").write_text(f"frames,return,eval_spl\\n100,1,{{seed}}0\\n150,2,\\n200,3,50\\n")
+"""
 
 
-@pytest.mark.parametrize(("task", "name"), [("nogo", "PPO")])
-def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monkeypatch, task: str, name: str) -> None:
-    monkeypatch.setattr(sweep, "VEHICLES", 4)
-    monkeypatch.setattr(sweep, "POINTS", 2)
-    monkeypatch.setattr(sweep, "score", partial(score, max_steps=2))
-    chosen = sweep.ALGORITHMS[name]
-    settings = chosen.settings | {"n_steps": 2, "batch_size": 16}
-    monkeypatch.setitem(sweep.ALGORITHMS, name, chosen._replace(num_envs=8, settings=settings))
-    monkeypatch.setitem(sweep.TASKS, task, sweep.TASKS[task]._replace(budget={name: 0.032}))
-    job = (sweep.Config(out=tmp_path), task, name, 0)
-    rows = read_csv(sweep.run(job[0], job[1:]))
-    assert rows["steps"].tolist() == [8, 16, 32, 32]
-    assert rows[["task", "algorithm", "seed"]].drop_duplicates().to_numpy().tolist() == [[*job[1:]]]
-    assert rows[["SR", "SPL"]].to_numpy().min() >= 0
-    assert rows["cpu_s"].is_monotonic_increasing
-    kept = score(tmp_path / f"{task}-{name}-seed0.onnx", task, episodes=4, max_steps=2)
-    assert rows[["SPL", "return"]].iloc[-1].tolist() == pytest.approx([kept["SPL"], kept["return"]], abs=0.02)
-    monkeypatch.setattr(sweep, "trained", None)
-    assert len(read_csv(sweep.run(job[0], job[1:]))) == len(rows)
+@pytest.fixture(autouse=True)
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Score few episodes, in a folder with a script that trains nothing."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sweep, "EPISODES", 8)
+    Path("mine.py").write_text(SCRIPT, encoding="utf-8")
 
 
-def test_an_interrupted_training_by_a_recipe_begins_again(tmp_path: Path, monkeypatch) -> None:
-    """The recipe refuses the folder of a run."""
-    (tmp_path / "box-GG-TD3-seed0").mkdir()
-    monkeypatch.setattr(sweep, "recipe", lambda *about: [{"steps": about[-1].exists()}])
-    assert read_csv(sweep.run(sweep.Config(out=tmp_path), ("box", "GG-TD3", 0)))["steps"].tolist() == [False]
+def run(*seeds: int, command: str = "mine=python mine.py", out: str = "mine") -> None:
+    """Sweep the script over seeds."""
+    sweep.main(["--command", command, "--seeds", *map(str, seeds), "--out", out, "--", "--task", "box"])
 
 
-def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for results, options, message in (
-        ("new/folder", [], "none of the algorithms"),
-        ("file/folder", [], "cannot write"),
-        ("new", ["--tasks", "mars"], "task must be one of .*, got 'mars'"),
-    ):
-        with pytest.raises((UsageError, OSError), match=message):
-            sweep.main(["--no-train", "--out", str(tmp_path / "runs"), "--results", str(tmp_path / results), *options])
-    assert (tmp_path / "new" / "folder").is_dir()
-    with locked(tmp_path), pytest.raises(UsageError, match="another process is writing"):
-        sweep.main(["--out", str(tmp_path), "--results", str(tmp_path)])
+def calls() -> list[list]:
+    """Return options, files in the run folder, and environment of each call of the script."""
+    return [json.loads(line) for line in Path("calls.jsonl").read_text("utf-8").splitlines()]
 
 
-def test_a_recipe_that_fails_says_why(tmp_path: Path, monkeypatch) -> None:
-    assert all((ROOT / "recipes" / script).is_file() for script, *_ in sweep.RECIPES.values())
-    (tmp_path / "fails.py").write_text("raise SystemExit('no power')", encoding="utf-8")
-    monkeypatch.setitem(sweep.RECIPES, "GG-TD3", (str(tmp_path / "fails.py"),))
-    with pytest.raises(UsageError, match=r"fails\.py ended with status 1: no power"):
-        sweep.recipe("box", "GG-TD3", 0, tmp_path)
+def test_each_seed_is_trained_once_and_scored_as_by_the_library(capsys) -> None:
+    run(0, 1)
+    printed = capsys.readouterr().out
+    options = {"--task": "box", "--seed": "1", "--out": str(Path("mine/box-mine-seed1").resolve())}
+    assert calls()[1] == [options, [], "1", "mine"]
+    scores = read_csv("mine/scores.csv.gz")
+    assert list(scores) == ["task", "agent", "seed", "episode", "success", "SPL", "return", "steps"]
+    assert scores[["task", "agent"]].drop_duplicates().to_numpy().tolist() == [["box", "mine"]]
+    assert scores["episode"].tolist() == [*range(8), *range(8)]
+    for seed, agent in enumerate(("eddies", "memory")):
+        mean, wanted = scores[scores["seed"] == seed].mean(numeric_only=True), score(agent, "box", episodes=8)
+        shown = {
+            "SR": 100 * mean["success"],
+            "SPL": 100 * mean["SPL"],
+            "return": mean["return"],
+            "steps": mean["steps"],
+        }
+        assert shown == pytest.approx({key: wanted[key] for key in shown}, rel=1e-4)
+        row = " | ".join(f"{wanted[key]:.1f}" for key in shown)
+        assert f"| mine | {seed} | {row} |\n" in printed
+    assert Path("mine/table.md").read_text("utf-8").strip() in printed
+    assert Path("mine/curves.png").stat().st_size > 1000
+    whole = Path("mine/scores.csv.gz").read_bytes()
+    run(0, 1)
+    assert len(calls()) == 2
+    assert Path("mine/scores.csv.gz").read_bytes() == whole
+    assert capsys.readouterr().out == printed
 
 
-@pytest.mark.parametrize("name", ["bars", "publish"])
-def test_help_is_printed(name: str, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sys, "argv", [name, "--help"])
-    with pytest.raises(SystemExit, match="0"):
-        runpy.run_path(str(TABLES / f"{name}.py"), run_name="__main__")
-    assert "usage" in capsys.readouterr().out
+def test_an_interrupted_run_goes_on_and_another_begins_again(capsys) -> None:
+    with pytest.raises(UsageError, match=r"box-mine-seed5: 'python mine\.py' ended with status 130"):
+        run(5)
+    with pytest.raises(UsageError, match=r"seed6: 'python mine.py' ended with status 1: ValueError: no luck \(all in "):
+        run(6)
+    run(5, 6)
+    folder = str(Path("mine/box-mine-seed5").resolve())
+    assert [(sorted(given), left) for given, left, *_ in calls()[2:]] == [
+        (["--resume"], ["config.json"]),
+        (["--out", "--seed", "--task"], []),
+    ]
+    assert calls()[2][0] == {"--resume": folder}
+    assert "| mine | IQM |" in capsys.readouterr().out
 
 
-def test_jobs_of_one_seed_come_first() -> None:
-    jobs = list(sweep.planned(sweep.Config(tasks=("box", "storm"), seeds=(3, 4))))
-    assert [seed for *_, seed in jobs] == sorted(seed for *_, seed in jobs)
-    names = {"PPO", "SAC", "TD3", "GG-TD3"}
-    assert {(task, name) for task, name, seed in jobs if seed == 4} == {("box", name) for name in names} | {
-        ("storm", name) for name in ("PPO", "ppo_memory")
-    }
+def test_a_complete_run_of_a_recipe_is_scored_without_its_command() -> None:
+    with pytest.raises(UsageError, match="status 130"):
+        run(5)
+    folder = Path("mine/box-mine-seed5")
+    (folder / "eval.json").touch()
+    (folder / "policy.safetensors").write_bytes((PRETRAINED / "eddies.safetensors").read_bytes())
+    run(5)
+    assert len(calls()) == 1
+    assert not Path("mine/curves.png").exists()
 
 
-def test_the_rule_turns_as_little_as_clears_the_area_ahead() -> None:
-    """From 60 km before the edge of a disc of 20 km, slightly to the left: to the right of it, and no further."""
-    rule = bars.Around(Secant())
-    rule.navigator.forward = lambda state: state.set("action", torch.tensor([[50.0, 0.0], [30.0, 0.0]]))
-    angle, closeness = math.radians(-5.0), 1 - 60 / bars.SIGHT_KM
-    disc = torch.tensor([closeness * math.cos(angle), closeness * math.sin(angle), 20 / bars.RADIUS_KM[1]])
-    whole, short = rule(TensorDict(areas=torch.cat((disc, torch.zeros(6))).expand(2, 9), batch_size=2))["action"]
-    tangent = angle + math.asin((20 + rule.BESIDE_KM) / 80)
-    torch.testing.assert_close(whole, torch.tensor([50.0, tangent]), atol=0.01, rtol=0)
-    assert short.tolist() == [30.0, 0.0]  # the destination is before the disc
+def test_errors_say_which_run_and_what_to_do() -> None:
+    with pytest.raises(UsageError, match=r"seed7: 'python mine.py' left no policy\.safetensors or policy\.onnx in .*"):
+        run(7)
+    with pytest.raises(UsageError, match=r"seed0: 'pithon mine\.py' ended with status 127: .*pithon.*No such file"):
+        run(0, command="mine=pithon mine.py")
+    run(0)
+    with pytest.raises(UsageError, match=r"is of 'python mine\.py', not of 'python mine\.py --x': choose another"):
+        run(0, command="mine=python mine.py --x")
+    with locked(Path("mine")), pytest.raises(UsageError, match="another process is writing"):
+        run(0)
 
 
-def test_references_around_areas_keep_their_order(monkeypatch) -> None:
-    monkeypatch.setattr(bars, "VEHICLES", 24)
-    bars.bar.cache_clear()
-    straight, rule, sighted, around = (bars.bar("nogo", name) for name in ("geodesic", "around", "sighted", "detour"))
-    bars.bar.cache_clear()
-    assert 90 < rule["SPL"] < sighted["SPL"] < around["SPL"]
-    assert straight["SR"] < 50 < 90 < rule["SR"]
-    assert around["SR"] == sighted["SR"] == 100
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["td3_gradient_guided.py"], "name the task after --"),
+        (["td3_gradient_guided.py", "--", "--task"], "name the task after --"),
+        (["td3_gradient_guided.py", "--", "--task", "mars"], "task must be one of .*, got 'mars'"),
+        (["td4.py", "--", "--task", "box"], r"there is no recipe .*td4\.py: give another program by --command"),
+        (["--", "--task", "box"], "name a recipe, a --command or both"),
+        (["td3_gradient_guided.py", "--seeds", "--", "--task", "box"], "at least one of the --seeds"),
+        (["--command", "python mine.py", "--", "--task", "box"], "takes NAME='COMMAND'.* got python mine.py"),
+        (["--command", "a=x", "--command", "a=y", "--", "--task", "box"], "a name of its own, got a=x and a=y"),
+        (["--command", "a/b=x", "--", "--task", "box"], "takes NAME='COMMAND'"),
+    ],
+)
+def test_a_sweep_is_refused_before_anything_is_trained(args: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        sweep.main(args)
+    assert not Path("runs").exists()
 
 
-def test_the_table_has_the_middle_of_the_runs(monkeypatch) -> None:
-    monkeypatch.setattr(sweep, "bars_of", lambda task: [])  # noqa: ARG005
-    curves = read_csv(RESULTS / "scores.csv")
-    chosen = curves[(curves["task"] == "storm") & (curves["algorithm"] == "PPO")]
-    last = torch.tensor(chosen.groupby("seed")["SPL"].last().to_numpy()).sort().values
-    (line,) = [line for line in sweep.table(chosen).splitlines() if "| PPO |" in line]
-    assert f"{last[1:4].mean():.1f} (" in line
-    assert line.split(" (")[0] in (RESULTS / "scores.md").read_text("utf-8")
+def test_recipes_and_commands_share_seeds_and_options() -> None:
+    config = sweep.Config("ppo_memory.py", ("mine=python 'my file.py'",), seeds=(3, 4, 3))
+    jobs = sweep.planned(config, ["--noise", "0", "--task", "storm", "--x=a b"])
+    assert [job[1:3] for job in jobs] == [("ppo_memory", 3), ("mine", 3), ("ppo_memory", 4), ("mine", 4)]
+    assert jobs[0].line == f"python {ROOT / 'recipes' / 'ppo_memory.py'} --noise 0 '--x=a b'"
+    assert jobs[3].line == "python 'my file.py' --noise 0 '--x=a b'"
+    assert jobs[3].folder == Path("runs/sweep-storm/storm-mine-seed4").resolve()
+
+
+def test_the_table_has_the_middle_of_the_seeds() -> None:
+    spl = torch.tensor([0.0, 0.97, 0.98, 0.99, 1.0]).double()
+    rows = {"agent": "A", "seed": range(5), "success": 1, "SPL": spl, "return": 2.0, "steps": 9}
+    *_, last, iqm = sweep.table(DataFrame(rows)).splitlines()
+    low, high = stratified_bootstrap([100 * spl])
+    assert last == "| A | 4 | 100.0 | 100.0 | 2.0 | 9.0 |"
+    assert f"| A | IQM | 100.0 (100.0–100.0) | 98.0 ({low:.1f}–{high:.1f}) | 2.0" in iqm
+    assert interquartile_mean(spl).item() == pytest.approx(0.98)
+
+
+def test_curves_are_the_evaluations(tmp_path: Path) -> None:
+    job = sweep.Job.of(tmp_path, "box", "A", 3, "x")
+    assert sweep.curves([job]).empty
+    job.folder.mkdir()
+    (job.folder / "train.csv").write_text("frames,return,eval_spl\n10,1,\n20,2,50\n30,3,60\n", encoding="utf-8")
+    points = sweep.curves([job, sweep.Job.of(tmp_path, "box", "A", 4, "x")])
+    assert points[["agent", "seed", "frames", "eval_spl"]].to_numpy().tolist() == [["A", 3, 20, 50], ["A", 3, 30, 60]]
+    (line,) = sweep.figure(points).axes[0].lines
+    assert line.get_xydata().tolist() == [[20, 50], [30, 60]]
+
+
+@pytest.mark.slow
+def test_results_are_the_same_for_any_number_of_jobs(capsys) -> None:
+    tiny = ["--total-frames", "4096", "--num-envs", "256", "--eval-trips", "50", "--eval-trips-small", "20"]
+    options = ["--", "--task", "box", "--wandb-mode", "disabled", *tiny]
+    for jobs in ("1", "2"):
+        args = ["td3_gradient_guided.py", "--seeds", "0", "1", "--jobs", jobs, "--out", f"jobs{jobs}", *options]
+        sweep.main(args)
+    one, two = capsys.readouterr().out.split("\n\nTable")[:2]
+    files = [Path(f"jobs{jobs}/box-td3_gradient_guided-seed1/policy.safetensors").read_bytes() for jobs in (1, 2)]
+    assert files[0] == files[1]
+    assert one in two
+    config = json.loads(Path("jobs2/box-td3_gradient_guided-seed1/config.json").read_text("utf-8"))
+    assert (config["seed"], config["task"], config["wandb_group"]) == (1, "box", "")

@@ -1,0 +1,143 @@
+"""The scores of algorithms on the named tasks, and their bars."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+from pandas import DataFrame, read_csv
+from support.recipes import ROOT, TABLES, load
+from tensordict import TensorDict
+
+from magrl.navigators import Secant
+from magrl.training import parse_config
+
+pytest.importorskip("stable_baselines3")
+scores = load("docs/tables/scores")
+bars = sys.modules["bars"]
+RESULTS = ROOT / "docs" / "results"
+RECIPES = [path for path in (ROOT / "recipes").glob("*.py") if path.stem.startswith(("ppo", "td3"))]
+
+
+@pytest.fixture
+def without_bars(monkeypatch) -> None:
+    """Fly no navigators, and draw small figures."""
+    monkeypatch.setattr(scores, "bars_of", lambda task: [])  # noqa: ARG005
+
+
+def test_each_command_of_the_file_can_be_given() -> None:
+    known = {"sb3": load("docs/examples/sb3"), **{path.stem: load(f"recipes/{path.stem}") for path in RECIPES}}
+    for job in scores.planned(scores.Config(seeds=(3,))):
+        python, script, *options = job.line.split()
+        module = known[Path(script).stem]
+        options += ["--task", job.task, "--seed", "3", "--out", "runs/x"]
+        own = hasattr(module, "PRESETS")
+        parsed = parse_config(module.Config, module.PRESETS, "", None, options) if own else None
+        config = parsed or tyro.cli(module.Config, args=options)
+        assert python == "python"
+        assert (ROOT / script).is_file()
+        assert (config.task, config.seed, config.out) == (job.task, 3, Path("runs/x"))
+
+
+def test_rows_of_a_run_replace_its_old_ones(tmp_path: Path, monkeypatch, without_bars) -> None:  # noqa: ARG001
+    """The curve, and the score with the CPU time as its last point; other runs and tasks stay."""
+    text = "task,algorithm,seed,steps,cpu_s,SR,SPL,return\nbox,mine,0,1,1,1,1,1\nbox,PPO,0,5,7.5,90,80,12\n"
+    (tmp_path / "scores.csv").write_text(text, encoding="utf-8")
+
+    def swept(runs: list, **options: object) -> DataFrame:
+        assert options == {"jobs": 2, "backend": "loky", "address": None}
+        (job,) = runs
+        job.folder.mkdir(parents=True)
+        (job.folder / "train.csv").write_text("frames,eval_success_rate,eval_spl\n9,50,40\n20,60,50\n", "utf-8")
+        (job.folder / "policy.safetensors").touch()
+        Path(f"{job.folder}.log").write_text("python mine.py\nhello\nCPU time 83.2 s\n", "utf-8")
+        about = {"task": "box", "agent": "mine", "seed": 0, "episode": [0, 1]}
+        return DataFrame({**about, "success": [0, 1], "SPL": [0.0, 0.9], "return": [1.0, 3.0], "steps": 9})
+
+    monkeypatch.setattr(scores, "sweep", swept)
+    options = ["--tasks", "box", "--seeds", "0", "--algorithms", "--command", "mine=python mine.py"]
+    scores.main([*options, "--out", str(tmp_path / "runs"), "--results", str(tmp_path)])
+    rows = read_csv(tmp_path / "scores.csv")
+    assert rows[["algorithm", "steps", "cpu_s", "SR", "SPL", "return"]].fillna(-1).to_numpy().tolist() == [
+        ["PPO", 5, 7.5, 90, 80, 12],
+        ["mine", 9, -1, 50, 40, -1],
+        ["mine", 20, -1, 60, 50, -1],
+        ["mine", 20, 83.2, 50, 45, 2],
+    ]
+    assert "| box | mine | 1 × 0 k | 1.4 min | 2.0 | 50.0 | 45.0 |" in (tmp_path / "scores.md").read_text("utf-8")
+    assert (tmp_path / "agents" / "box-mine.safetensors").exists()
+    with (tmp_path / "runs" / "box-mine-seed0.log").open("a", encoding="utf-8") as log:
+        log.write("python mine.py\nCPU time 1.0 s\n")
+    (job,) = scores.planned(scores.Config(("box",), (), ("mine=python mine.py",), (0,), out=tmp_path / "runs"))
+    assert math.isnan(scores.cpu_s(job))  # it was resumed, and its first part is not known
+
+
+def test_known_results_are_drawn_without_training(tmp_path: Path, monkeypatch, without_bars) -> None:  # noqa: ARG001
+    (tmp_path / "scores.csv").write_bytes((RESULTS / "scores.csv").read_bytes())
+    monkeypatch.setattr(scores, "sweep", None)
+    scores.main(["--no-train", "--results", str(tmp_path), "--out", str(tmp_path)])
+    own = [line for line in (RESULTS / "scores.md").read_text("utf-8").splitlines() if " × " in line]
+    head, _, *drawn = (tmp_path / "scores.md").read_text("utf-8").splitlines()
+    assert [head, *drawn] == own
+    curves = read_csv(RESULTS / "scores.csv")
+    (axes, *_), runs = scores.figure(curves).subfigs[0].axes, curves[curves["task"] == "box"]
+    ppo = runs[runs["algorithm"] == "PPO"].groupby("seed")[["steps", "SPL"]].nth(2).median()
+    assert axes.lines[0].get_xydata()[2].tolist() == ppo.tolist()
+    assert (tmp_path / "scores.png").exists()
+
+
+def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for results, options, message in (
+        ("new/folder", [], "has no runs"),
+        ("file/folder", [], "cannot write"),
+        ("new", ["--tasks", "mars"], "task must be one of .*, got 'mars'"),
+        ("new", ["--algorithms", "A2C"], "algorithm must be one of .*, got 'A2C'"),
+    ):
+        with pytest.raises((ValueError, OSError), match=message):
+            scores.main(["--no-train", "--out", str(tmp_path / "runs"), "--results", str(tmp_path / results), *options])
+    assert (tmp_path / "new" / "folder").is_dir()
+
+
+@pytest.mark.parametrize("name", ["bars", "publish"])
+def test_help_is_printed(name: str, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(TABLES / f"{name}.py"), run_name="__main__")
+    assert "usage" in capsys.readouterr().out
+
+
+def test_jobs_of_one_seed_come_first() -> None:
+    jobs = scores.planned(scores.Config(tasks=("box", "storm"), seeds=(3, 4)))
+    assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
+    names = {"PPO", "SAC", "TD3", "GG-TD3"}
+    assert {job[:2] for job in jobs if job.seed == 4} == {("box", name) for name in names} | {
+        ("storm", name) for name in ("PPO", "ppo_memory")
+    }
+
+
+def test_the_rule_turns_as_little_as_clears_the_area_ahead() -> None:
+    """From 60 km before the edge of a disc of 20 km, slightly to the left: to the right of it, and no further."""
+    rule = bars.Around(Secant())
+    rule.navigator.forward = lambda state: state.set("action", torch.tensor([[50.0, 0.0], [30.0, 0.0]]))
+    angle, closeness = math.radians(-5.0), 1 - 60 / bars.SIGHT_KM
+    disc = torch.tensor([closeness * math.cos(angle), closeness * math.sin(angle), 20 / bars.RADIUS_KM[1]])
+    whole, short = rule(TensorDict(areas=torch.cat((disc, torch.zeros(6))).expand(2, 9), batch_size=2))["action"]
+    tangent = angle + math.asin((20 + rule.BESIDE_KM) / 80)
+    torch.testing.assert_close(whole, torch.tensor([50.0, tangent]), atol=0.01, rtol=0)
+    assert short.tolist() == [30.0, 0.0]  # the destination is before the disc
+
+
+def test_references_around_areas_keep_their_order(monkeypatch) -> None:
+    monkeypatch.setattr(bars, "VEHICLES", 24)
+    bars.bar.cache_clear()
+    straight, rule, sighted, around = (bars.bar("nogo", name) for name in ("geodesic", "around", "sighted", "detour"))
+    bars.bar.cache_clear()
+    assert 90 < rule["SPL"] < sighted["SPL"] < around["SPL"]
+    assert straight["SR"] < 50 < 90 < rule["SR"]
+    assert around["SR"] == sighted["SR"] == 100
