@@ -113,6 +113,7 @@ def results(config: Config) -> DataFrame:
         new = concat([rows_of(job, by_run.get_group(job[:3])) for job in jobs])
         known = concat([known[~known.set_index(RUN).index.isin(new.set_index(RUN).index)], new])
         write_with(path, known.to_csv, index=False)
+        known = read_csv(path)
     if known.empty:
         raise UsageError(f"{path} has no runs, and none of the algorithms {config.algorithms} is trained now")
     return known

@@ -71,6 +71,10 @@ def test_rows_of_a_run_replace_its_old_ones(tmp_path: Path, monkeypatch, without
     ]
     assert "| box | mine | 1 × 0 k | 1.4 min | 2.0 | 50.0 | 45.0 |" in (tmp_path / "scores.md").read_text("utf-8")
     assert (tmp_path / "agents" / "box-mine.safetensors").exists()
+    (tmp_path / "scores.csv").unlink()
+    (tmp_path / "runs" / "box-mine-seed0").rename(tmp_path / "earlier")
+    scores.main([*options, "--out", str(tmp_path / "runs"), "--results", str(tmp_path)])
+    assert len(read_csv(tmp_path / "scores.csv")) == 3
     with (tmp_path / "runs" / "box-mine-seed0.log").open("a", encoding="utf-8") as log:
         log.write("python mine.py\nCPU time 1.0 s\n")
     (job,) = scores.planned(scores.Config(("box",), (), ("mine=python mine.py",), (0,), out=tmp_path / "runs"))

@@ -23,6 +23,7 @@ from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import CHANGEABLE, resumed_config
 from magrl.training.curves import TrainingStatistics
 from magrl.training.run import StopRequest
+from magrl.training.wandb_run import WandbRun
 
 ROOT = Path(__file__).parent.parent.parent
 AZORES = ROOT / "docs" / "examples" / "azores.toml"
@@ -89,6 +90,25 @@ def test_run_is_named_after_its_scenario_and_noise() -> None:
     for options, name in (({}, "mine"), ({"scenario": AZORES, "noise": (0.05, 0, 1)}, "mine-azores-noise-0.05-0-1")):
         run = in_run(RegionConfig(seed=2, **options))
         assert (run.name, run.folder) == (name, Path("runs") / f"{name}-seed2")
+
+
+@pytest.mark.parametrize(
+    ("given", "environment", "group"), [("", "", "mine"), ("", "sweep-box", "sweep-box"), ("own", "sweep-box", "own")]
+)
+def test_a_group_in_wandb_is_chosen_or_of_the_sweep(tmp_path: Path, monkeypatch, given, environment, group) -> None:
+    groups = []
+
+    def opened(*args: object, **options: object) -> WandbRun:
+        groups.append(options["group"])
+        return WandbRun(*args, **options)
+
+    monkeypatch.delenv("WANDB_RUN_GROUP", raising=False)
+    if environment:
+        monkeypatch.setenv("WANDB_RUN_GROUP", environment)
+    monkeypatch.setattr(run, "WandbRun", opened)
+    config = RegionConfig(out=tmp_path / "run", wandb_mode="disabled", wandb_group=given)
+    in_run(config)._make_log(resumed=True)._open_log(run_id="")
+    assert groups == [group]
 
 
 def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
