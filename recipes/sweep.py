@@ -38,7 +38,6 @@ from magrl.navigators.names import policy_file
 from magrl.training import UsageError, command, parse
 from magrl.training.curves import draw_seeds
 
-import torch
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
 from tyro.conf import Positional, UseAppendAction
@@ -149,7 +148,6 @@ def sweep(runs: Sequence[Job], **options: Any) -> DataFrame:
     """
     path = runs[0].folder.with_name("scores.csv.gz")
     check_writable(path)
-    torch.set_num_threads(1)  # as in other processes, for the same digits
     with locked(path.parent):
         episodes = list(mapped(run, runs, unit="run", **options))
         write_episodes(path, episodes)
@@ -226,4 +224,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command(RECIPE, main, ValueError)
+    command(RECIPE, main, ValueError, ImportError)
