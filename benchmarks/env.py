@@ -7,7 +7,7 @@ import time
 from benchmarks.timing import Row, alternate
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.errors import SensorErrors, VectorErrors, north_reference
-from magrl.training.run import make_collector
+from magrl.training.collectors import make_collector
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv

@@ -4,6 +4,7 @@
     python recipes/ppo_anywhere.py --preset fast    # destinations 300-500 km away
     python recipes/ppo_anywhere.py --arrival declared --max-steps 80 --price-range 0.01 0.1
     python recipes/ppo_anywhere.py --resume RUN     # resume an interrupted run exactly
+    python recipes/ppo_anywhere.py --collectors 8 --address auto    # on a Ray cluster (docs/machines.md)
 
 The agent corrects the leg that dual control plans, so that it begins as the navigator `kalman`. The regions are
 patches of planets whose magnetic fields share only the spectrum and the polarity of the Earth's. The
@@ -30,6 +31,7 @@ from magrl.pilot.network import correction_network
 from magrl.pilot.observation import OBSERVATION_SIZE
 from magrl.random_numbers import TEST_SEED, VALIDATION_SEED
 from magrl.training import Run, command, optimize, parse_config
+from magrl.training.collectors import RemoteCollector, make_collector
 from magrl.training.config import (
     Count,
     Discount,
@@ -42,7 +44,6 @@ from magrl.training.config import (
     make_presets,
     read_presets,
 )
-from magrl.training.run import make_collector
 from magrl.transforms import (
     DeclareArrival,
     HighestSPL,
@@ -152,6 +153,18 @@ def make_env(base: GeomagneticNavEnv, config: Config) -> TransformedEnv:
     return env
 
 
+def options_of(config: Config) -> dict[str, Any]:
+    """Return the options of all environments of a training."""
+    return config.rules | {"start_heading": "random", "drift_km": config.drift_km, "device": config.device}
+
+
+def training_env(config: Config) -> TransformedEnv:
+    """Return the environment of the training, on random planets."""
+    planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
+    base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options_of(config))
+    return make_env(base, config)
+
+
 def evaluation_env(scenario: Scenario, num_trips: int, seed: int, config: Config, **options: Any) -> TransformedEnv:
     """Return an environment of random trips of a scenario, drawn once, with the noise of the sensors."""
     trips = scenario.random_trips(num_trips, seed)
@@ -178,14 +191,12 @@ def train(config: Config) -> dict[str, float]:
     torch.manual_seed(config.seed)
     with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
         # Environments
-        options = config.rules | {"start_heading": "random", "drift_km": config.drift_km, "device": config.device}
-        planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
-        base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
+        env, options = training_env(config), options_of(config)
         others = planet_scenario(256, seed=VALIDATION_SEED, **config.regions)
         validation = evaluation_env(others, config.eval_trips_small, VALIDATION_SEED, config, **options)
         earth = earth_scenario(128, seed=TEST_SEED, **config.regions)
         test = evaluation_env(earth, config.eval_trips, TEST_SEED, config, **options)
-        env, rules = make_env(base, config), rules_of(base, config)
+        rules = rules_of(env.base_env, config)
 
         # Networks: only the critic reads the true displacement and the SPL that can still be reached
         network = correction_network(config.num_cells, env.device)
@@ -211,11 +222,14 @@ def train(config: Config) -> dict[str, float]:
         optimizer = Adam([{"params": group, "lr": 0.0} for group in weights], fused=True)
 
         frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
-        collector = make_collector(env, stochastic_actor, **frames)
+        if config.collectors:
+            collector = RemoteCollector(training_env, config, stochastic_actor, **frames)
+        else:
+            collector = make_collector(env, stochastic_actor, **frames)
         run.start(
             policy=Anywhere(rules, network),
             validation=validation,
-            env=base,
+            env=env.base_env,
             collector=collector,
             loss=loss,
             optimizer=optimizer,
@@ -246,4 +260,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command(RECIPE, main)
+    command(RECIPE, main, ImportError)

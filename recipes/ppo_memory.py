@@ -5,6 +5,7 @@
     python recipes/ppo_memory.py --preset fast       # one million steps, four minutes
     python recipes/ppo_memory.py --preset large --device cuda
     python recipes/ppo_memory.py --resume RUN        # resume an interrupted run exactly
+    python recipes/ppo_memory.py --collectors 8 --address auto    # on a Ray cluster (docs/machines.md)
 
 The agent observes what its sensors measure and its own legs, step by step. A gated recurrent unit (GRU) estimates the
 displacement to the destination, and is trained to predict the true one. PPO learns the legs, given the memory, as
@@ -23,8 +24,8 @@ from magrl.navigators.memory import LIMITS, Memory, MemoryNetwork, action_of
 from magrl.navigators.networks import Spread, make_drawn_correction, make_mlp
 from magrl.random_numbers import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED
 from magrl.training import Run, command, optimize, parse_config
+from magrl.training.collectors import RemoteCollector, make_collector
 from magrl.training.config import Count, PlanetConfig, Positive, Widths, make_presets, read_presets
-from magrl.training.run import make_collector
 from magrl.transforms.areas import turned
 from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE
 
@@ -80,8 +81,9 @@ class Config(PlanetConfig):
 PRESETS = make_presets(Config, TABLES)
 
 
-def make_env(planets: Scenario, config: Config) -> TransformedEnv:
-    """Return the task with an empty memory, and the privileged inputs of critic and reward, for training only."""
+def make_env(config: Config) -> TransformedEnv:
+    """Return the task on random planets with an empty memory, and the privileged inputs of critic and reward."""
+    planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
     env = task_env(
         planets, config, num_envs=config.num_envs, seed=config.seed, reward="spl", step_price=config.step_price
     )
@@ -155,7 +157,7 @@ def train(config: Config) -> dict[str, float]:
     torch.manual_seed(config.seed)
     with Run(config, recipe=RECIPE, name=f"ppo_memory-{config.task}-{config.preset}", losses=LOSSES) as run:
         # Environments: the validation has storms of the training, not the record
-        env = make_env(planet_scenario(config.num_regions, seed=config.seed, **config.regions), config)
+        env = make_env(config)
         others = planet_scenario(256, seed=VALIDATION_SEED, **config.regions)
         seeds = VALIDATION_SEED, VALIDATION_SEED - FIRST_RESERVED_SEED
         validation = evaluation_env(others, config.eval_trips_small, *seeds, config)
@@ -182,7 +184,11 @@ def train(config: Config) -> dict[str, float]:
         optimizer = Adam([{"params": group, "lr": 0.0} for group in (corrects, critic.parameters())], fused=True)
 
         frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
-        collector = make_collector(env, TensorDictSequential(memory, correction, leg), **frames)
+        agent = TensorDictSequential(memory, correction, leg)
+        if config.collectors:
+            collector = RemoteCollector(make_env, config, agent, **frames)
+        else:
+            collector = make_collector(env, agent, **frames)
         parts = {"loss": loss, "optimizer": optimizer, "memory_optimizer": memory_optimizer, "spread": spread}
         policy = Memory(network, accuracy_range(validation.reset()))
         run.start(policy=policy, validation=validation, env=env.base_env, collector=collector, memory=memory, **parts)
@@ -214,4 +220,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    command(RECIPE, main)
+    command(RECIPE, main, ImportError)

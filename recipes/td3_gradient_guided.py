@@ -26,8 +26,8 @@ from magrl.errors import SensorErrors
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import FieldPolicy, PolicyConfig, make_critic
 from magrl.training import Run, SoftUpdate, TD3Loss, command, optimize, parse_config, saturation_penalty
+from magrl.training.collectors import make_collector
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
-from magrl.training.run import make_collector
 from magrl.transforms import DistanceCost, EpisodeSum, ProgressReward, TrueDisplacement
 
 import torch

@@ -41,7 +41,7 @@ Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
 
 
 WANDB_OPTIONS = ("wandb_entity", "wandb_group", "wandb_tags")
-CHANGEABLE = ("device", "wandb_mode", *WANDB_OPTIONS, "log_every", "checkpoint_every", "out", "resume")
+CHANGEABLE = ("device", "wandb_mode", *WANDB_OPTIONS, "log_every", "checkpoint_every", "address", "out", "resume")
 """Settings that may be edited in ``config.json`` before a run is resumed: they are not part of the training."""
 
 
@@ -166,6 +166,11 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
 
     num_regions: Count = 1024
     """Number of training regions, two on each random planet."""
+    collectors: Annotated[int, Field(ge=0)] = 0
+    """Environments in Ray actors, each with num_envs / collectors vehicles and regions of its own; with 0, one in this
+    process. A training with collectors resumes exactly but for its running episodes, which begin anew."""
+    address: str = "local"
+    """Ray cluster of the collectors: local (an instance of its own), auto (the one of this machine), or HOST:PORT."""
     distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a trip [km]."""
     steps_per_batch: Count = 32
@@ -195,6 +200,8 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
     def _fits(self) -> Self:
         if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
             raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
+        if self.collectors and self.num_envs % self.collectors:
+            raise ValueError(f"collectors {self.collectors} must divide num_envs, {self.num_envs}")
         if self.distance_range_km[1] > LONGEST_KM:
             message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
             raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")

@@ -18,7 +18,6 @@ from types import FrameType
 from typing import Any, Self
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -36,6 +35,7 @@ from magrl.navigators import Anywhere, FieldPolicy, save_policy
 from magrl.random_numbers import TEST_SEED, VALIDATION_SEED
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
+from magrl.training.collectors import LostCollectorError, RemoteCollector
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
 from magrl.training.wandb_run import WandbRun
@@ -75,25 +75,6 @@ class StopRequest:
         if self.exit_code is not None:
             raise KeyboardInterrupt
         self.exit_code = 128 + number  # exit status that a shell reports for a process ended by a signal
-
-
-def make_collector(env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> Collector:
-    """Return a collector whose batches are used before the next one is made.
-
-    Args:
-        env: environment; its device holds the batches.
-        policy: policy with its exploration.
-        **options: options of TorchRL's ``Collector``, such as ``frames_per_batch`` and ``total_frames``.
-
-    Example:
-        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> collector = make_collector(env, env.rand_action, frames_per_batch=4, total_frames=8)
-        >>> next(iter(collector)).shape
-        torch.Size([2, 2])
-        >>> collector.shutdown()
-    """
-    options |= {"track_traj_ids": False, "auto_register_policy_transforms": False}
-    return Collector(env, policy, return_same_td=True, **options)
 
 
 class Run:
@@ -153,7 +134,9 @@ class Run:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        if error[0] is KeyboardInterrupt and self.statistics.frames:
+        if self.statistics.frames and error[0] in (KeyboardInterrupt, LostCollectorError):
+            if error[0] is LostCollectorError:  # between two batches
+                self.checkpoints.save(self.statistics.frames)
             self._say_how_to_resume()
         self._exits.__exit__(*error)
 
@@ -209,7 +192,7 @@ class Run:
         policy: FieldPolicy | Anywhere,
         validation: EnvBase,
         env: GeomagneticNavEnv,
-        collector: Collector,
+        collector: Collector | RemoteCollector,
         **parts: Stateful,
     ) -> None:
         """Take the parts of the training, and restore them from the newest checkpoint of a run that is resumed.
@@ -217,7 +200,7 @@ class Run:
         Args:
             policy: agent for evaluations, which is saved.
             validation: environment of the validation trips.
-            env: environment inside the collector.
+            env: environment inside the collector, or like those of its actors.
             collector: source of batches.
             parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
 
@@ -234,7 +217,8 @@ class Run:
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts = {"configuration": self, **parts}  # restored first
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
-        parts["episodes"] = RunningEpisodes(collector, env)
+        if isinstance(collector, Collector):
+            parts["episodes"] = RunningEpisodes(collector, env)
         self._exits.callback(collector.shutdown)
         self.checkpoints = Checkpoints(self.folder / "checkpoints", parts)
         resumed = bool(self.config.resume and self.checkpoints.files())  # otherwise it starts again from its seed

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs.utils import check_env_specs
 
-from magrl import load_policy, planet_scenario, save_policy
+from magrl import load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.navigators import policy_env
@@ -25,7 +25,7 @@ CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=
 
 
 def training_env():
-    return recipe.make_env(planet_scenario(8, seed=3, **CONFIG.regions), CONFIG.replace(task="storm", seed=5))
+    return recipe.make_env(CONFIG.replace(task="storm", seed=5, num_regions=8))
 
 
 def network() -> MemoryNetwork:

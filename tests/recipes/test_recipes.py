@@ -200,6 +200,7 @@ def test_noise_is_observed_and_the_guidance_is_by_the_truth() -> None:
         (ppo_anywhere, "--max-turn-deg 200", "max_turn_deg must be less than or equal to 180, got 200.0"),
         (ppo_anywhere, "--scenario docs/examples/azores.toml", "Unrecognized options: --scenario"),
         (ppo_memory, "--noise 0.1 0 0", "Unrecognized options: --noise"),
+        (ppo_anywhere, "--collectors 3", "collectors 3 must divide num_envs, 4096"),
         (ppo_anywhere, "--num-envs 8", "must not exceed num_envs * steps_per_batch, 256"),
     ],
 )
