@@ -167,8 +167,8 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
     num_regions: Count = 1024
     """Number of training regions, two on each random planet."""
     collectors: Annotated[int, Field(ge=0)] = 0
-    """Environments in Ray actors, each with num_envs / collectors vehicles and regions of its own; with 0, one in this
-    process. A training with collectors resumes exactly but for its running episodes, which begin anew."""
+    """Environments in Ray actors, each with num_envs / collectors vehicles and regions; 0: one in this process.
+    With collectors, a resumed training is exact but for running episodes, which begin anew."""
     address: str = "local"
     """Ray cluster of the collectors: local (an instance of its own), auto (the one of this machine), or HOST:PORT."""
     distance_range_km: Rising = (300.0, 500.0)
