@@ -43,6 +43,7 @@ def make_collector(env: EnvBase, policy: TensorDictModuleBase, **options: Any) -
         **options: options of TorchRL's ``Collector``, such as ``frames_per_batch`` and ``total_frames``.
 
     Example:
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
         >>> collector = make_collector(env, env.rand_action, frames_per_batch=4, total_frames=8)
         >>> next(iter(collector)).shape

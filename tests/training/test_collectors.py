@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import runpy
 import signal
 import sys
 import tempfile
@@ -146,7 +147,14 @@ def test_address_that_does_not_answer(address: str) -> None:
         _check_answers(address)
 
 
-def test_without_ray_one_line_says_what_to_install(monkeypatch) -> None:
+def test_without_ray_one_line_says_what_to_install(tmp_path: Path, monkeypatch, capsys) -> None:
+    words = "--collectors 2 --num-envs 8 --num-regions 4 --batch-size 8 --eval-trips 2 --eval-trips-small 2 --out run"
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ImportError, match=r"pip install 'magrl\[ray\]'"):
-        RemoteCollector(ppo_anywhere.training_env, None, None)
+    monkeypatch.setattr(sys, "argv", [ppo_anywhere.RECIPE, *words.split()])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(ppo_anywhere.__file__, run_name="__main__")
+    assert stop.value.code == 2
+    message = "ppo_anywhere.py: this needs the package ray: pip install 'magrl[ray]'"
+    assert capsys.readouterr().err.strip() == message
+    assert not (tmp_path / "run").exists()
