@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import sys
 from collections import namedtuple
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache, partial
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from geographiclib.geodesic import Geodesic
@@ -261,6 +263,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
     from wrong_sheets import main  # so that other processes import these functions, with their caches
 
     main()
