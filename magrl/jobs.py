@@ -123,18 +123,36 @@ def _follow(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def connected(address: str | None, processors: int, **options: Any) -> Any:
+    """Return Ray, connected to a cluster.
+
+    Args:
+        address: ``"auto"`` or ``"HOST:PORT"``; None starts one with some processors on this machine.
+        processors: their number.
+        **options: of ``ray.init``.
+
+    Raises:
+        ConnectionError: if there is no cluster at the address.
+        ImportError: without Ray.
+    """
+    ray = library("ray", "ray")
+    host, colon, port = (address or "").rpartition(":")
+    try:
+        if colon:  # Ray would wait for minutes
+            socket.create_connection((host, int(port)), timeout=10).close()
+    except (OSError, ValueError) as error:
+        message = f"address must be auto or HOST:PORT of a Ray cluster that runs, got {address!r} ({error})"
+        raise ConnectionError(message) from error
+    # Without an address, Ray would wait for the cluster of a file that is left where one was killed.
+    own = {} if address else {"num_cpus": processors, "include_dashboard": False}
+    ray.init(address or "local", logging_level="error", log_to_driver=False, **own, **options)
+    return ray
+
+
 @contextmanager
 def _ray(jobs: int, address: str | None) -> Iterator[tuple[Callable[..., Future], Any]]:
-    ray = library("ray", "ray")
-    if address and ":" in address:  # Ray would wait for minutes
-        try:
-            socket.create_connection(tuple(address.rsplit(":", 1)), 10).close()  # type: ignore[arg-type]
-        except OSError as error:
-            raise ConnectionError(f"no Ray cluster is at {address} ({error}): start it by ray start --head") from error
-    # Without an address, Ray would wait for the cluster of a file that is left where one was killed.
-    options = {} if address else {"num_cpus": jobs, "include_dashboard": False}
     environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}  # modules beside a script or a test
-    ray.init(address or "local", runtime_env=environment, log_to_driver=False, **options)
+    ray = connected(address, jobs, runtime_env=environment)
     task, refs = ray.remote(max_retries=0)(_alone), []
 
     def submit(*call: Any) -> Future:

@@ -96,8 +96,9 @@ def test_no_process_is_left_when_the_command_is_killed(tmp_path: Path) -> None:
 
 def test_wrong_arguments_name_the_remedy(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace())
-    with pytest.raises(ConnectionError, match=r"no Ray cluster is at localhost:1 .*: start it by ray start --head"):
-        list(mapped(abs, [1], backend="ray", address="localhost:1"))
+    for address in ("127.0.0.1:9", "localhost:port", "nowhere.invalid:6379"):
+        with pytest.raises(ConnectionError, match=f"or HOST:PORT of a Ray cluster that runs, got '{address}'"):
+            list(mapped(abs, [1], backend="ray", address=address))
     monkeypatch.setitem(sys.modules, "ray", None)
     for options, error, message in (
         ({"backend": "ray"}, ImportError, r"pip install 'magrl\[ray\]'"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import signal
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -19,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from magrl.checks import library
 from magrl.commands import UsageError
+from magrl.jobs import connected
 from magrl.random_numbers import FIRST_RESERVED_SEED
 
 OPTIONS: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
@@ -68,6 +68,7 @@ class RemoteCollector:
 
     Raises:
         ImportError: without Ray.
+        ConnectionError: from the iterator, if there is no cluster at the address.
         UsageError: from the iterator, for a cluster with too few processors, or an actor that ends.
     """
 
@@ -98,12 +99,10 @@ class RemoteCollector:
     def _start(self) -> None:
         from torchrl.collectors.distributed import RayCollector
 
-        count, address, handler = self._config.collectors, self._config.address, signal.getsignal(signal.SIGTERM)
-        _check_answers(address)
+        count, handler = self._config.collectors, signal.getsignal(signal.SIGTERM)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         self._ray.cloudpickle.register_pickle_by_value(sys.modules[self._make_env.__module__])  # no other node has it
-        own: dict[str, Any] = {"num_cpus": count, "include_dashboard": False} if address == "local" else {}
-        self._ray.init(address=address, logging_level="error", log_to_driver=False, **own)
+        connected(self._config.address, count)
         if signal.getsignal(signal.SIGTERM) is not handler:  # Ray's own would end this process without a checkpoint
             signal.signal(signal.SIGTERM, handler)
         if (processors := self._ray.cluster_resources().get("CPU", 0)) < count:
@@ -119,17 +118,6 @@ class RemoteCollector:
             weight_sync_schemes={},  # they need a port of this machine, and its name
             **self._options,
         )
-
-
-def _check_answers(address: str) -> None:
-    """Raise a UsageError for a host and port that do not answer, for which Ray waits for minutes."""
-    host, colon, port = address.rpartition(":")
-    try:
-        if colon:
-            socket.create_connection((host, int(port)), timeout=10).close()
-    except (OSError, ValueError) as error:
-        message = f"address must be local, auto or HOST:PORT of a Ray cluster that runs, got {address!r} ({error})"
-        raise UsageError(message) from None
 
 
 def _worker_env(make_env: Callable[[Any], EnvBase], config: Any, seed: int) -> EnvBase:

@@ -169,8 +169,8 @@ class PlanetConfig(rule_settings("max_steps"), RunConfig):  # type: ignore[misc]
     collectors: Annotated[int, Field(ge=0)] = 0
     """Environments in Ray actors, each with num_envs / collectors vehicles and regions; 0: one in this process.
     With collectors, a resumed training is exact but for running episodes, which begin anew."""
-    address: str = "local"
-    """Ray cluster of the collectors: local (an instance of its own), auto (the one of this machine), or HOST:PORT."""
+    address: str | None = None
+    """Ray cluster of the collectors: auto (the one of this machine) or HOST:PORT; by default one of their own."""
     distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a trip [km]."""
     steps_per_batch: Count = 32
