@@ -107,7 +107,7 @@ def train(job: Job) -> None:
         status = subprocess.call([*own, *words], stdout=log, stderr=log, preexec_fn=_end_with_parent)
         log.write(b"" if status else f"CPU time {os.times().children_user - began:.1f} s\n".encode())
     if status:
-        *_, last = path.read_text("utf-8", "replace").splitlines()
+        *_, last = (text for line in path.read_text("utf-8", "replace").splitlines() if (text := line.strip(" │╰─╯╭╮")))
         raise UsageError(f"{job.folder.name}: {job.line!r} ended with status {status}: {last} (all in {path})")
 
 
