@@ -23,8 +23,8 @@ right accuracy, it stayed below 7 in simulation, under the conditions of four ve
 _LAST, _LEAST = 8, 2
 HANGS = 5.0
 """Expected change of an element along a leg, in standard deviations of its noise, after which an equal reading is that
-of a sensor that hangs. Chosen on 120 flights of a ship in an independent simulator whose D froze: against 20, right
-arrivals rise from 30 to 80, false ones from 4 to 5, and 13 are lost, not 72."""
+of a sensor that hangs. Of 120 ships whose D froze (row frozen-d of tests/onboard/wrong_sheets.py, seed 20261129), 80
+arrive, 4 claim it falsely and 28 are lost; with 20, it is 41, 3 and 74."""
 
 
 class Doubt(NamedTuple):

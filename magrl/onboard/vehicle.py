@@ -369,7 +369,8 @@ class Onboard:
                 return "nearest", f"{probability}, but readings do not fit what is stated (p = {doubt.fit:.1g})"
             if text := integrity.objection(self._rules, self._held, track.state.crust_nt.item()):
                 return "nearest", f"{probability}, but {text}"
-            return "arrived", f"within {options.radius_km:g} km with {probability}"
+            held = f"an estimated probability of {integrity.probability(self._held):.2f}"
+            return "arrived", f"within {options.radius_km:g} km with {held}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
         if last:
             return "nearest", f"out of steps: {near}"

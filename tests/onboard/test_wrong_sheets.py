@@ -27,7 +27,9 @@ def flights(row: str) -> list[Flight]:
 def test_a_right_sheet_and_a_spike_cost_no_flight(row: str) -> None:
     assert sum(flight.outcome in OUTCOMES[:2] for flight in flights(row)) >= 9
     assert sum(flight.outcome == OUTCOMES[2] for flight in flights(row)) <= 2
-    assert np.median([flight.fit for flight in flights(row)]) > 0.05
+    fits = [flight.fit for flight in flights(row)]
+    assert np.median(fits) > 0.05
+    assert row == "spike" or np.quantile(fits, 0.1) > 0.01
 
 
 @pytest.mark.slow
