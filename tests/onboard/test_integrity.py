@@ -98,6 +98,12 @@ def test_a_start_that_is_not_as_stated_is_no_arrival() -> None:
     assert "1.00, but 0.00 by a start to 100 km, whose own probability is " in flights[1][-1].reason
 
 
+def test_the_sentence_of_a_claim_has_the_probability_by_all_hypotheses() -> None:
+    last = sailed(9, radius_km=12.0)[1][-1]
+    assert last.hypotheses[0].arrival > last.confidence + 0.01
+    assert last.reason == f"within 12 km with an estimated probability of {last.confidence:.2f}"
+
+
 def test_anomalies_are_an_objection_without_a_known_start_alone() -> None:
     certain = [Hypothesis(name, 1.0, 1.0) for name in NAMES]
     rules, usual = Rules(integrity=True), Rules()
