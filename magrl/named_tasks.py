@@ -211,8 +211,8 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
             a key.
 
     Raises:
-        ValueError: for a reward without :class:`~magrl.transforms.ProgressReward` or
-            :class:`~magrl.transforms.SPLReward`: it would pay for an arrival through an area.
+        ValueError: for a reward without :class:`~magrl.transforms.SPLReward`: it would pay for an arrival through an
+            area.
 
     Example:
         >>> no_go_env(4, seed=0).rollout(3)["observation"].shape
@@ -222,12 +222,12 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
 
     from magrl.commands import UsageError
     from magrl.envs.navigation import navigation_env
-    from magrl.transforms import NoGoAreas, ProgressReward, SPLReward, TrueDisplacement
+    from magrl.transforms import NoGoAreas, SPLReward, TrueDisplacement
 
     env = navigation_env(num_envs, **{"max_steps": 20} | options)
-    if not any(isinstance(step, ProgressReward | SPLReward) for step in env.transform):
+    if not any(isinstance(step, SPLReward) for step in env.transform):
         given = options["reward"] if isinstance(options["reward"], str) else "another function"
-        raise UsageError(f"reward must be 'progress' or 'spl', got {given}: others pay for an arrival through an area")
+        raise UsageError(f"reward must be 'spl', got {given}: others pay for an arrival through an area")
     env.insert_transform(0, Compose(TrueDisplacement(), NoGoAreas(discs)))  # before the reward reads success
     for last in [step for step in env.transform if "observation" in step.out_keys][-1:]:
         parts = last.in_keys if isinstance(last, CatTensors) else ["observation_without_areas"]

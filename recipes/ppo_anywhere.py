@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal
 
 from magrl import Anywhere
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
+from magrl.envs.navigation import spl_reward
 from magrl.envs.scenario import rule_settings
 from magrl.errors import MotionError, SensorErrors, sensor_levels
 from magrl.navigators import make_correcting_actor
@@ -144,10 +145,8 @@ def make_env(base: GeomagneticNavEnv, config: Config) -> TransformedEnv:
     rules, known = rules_of(base, config), known_keys(env.observation_spec)
     declaration = [] if rules.signaled else [DeclareArrival(rules, known)]
     scaled_displacement = ObservationNorm(0.0, 1 / 200, ["true_displacement"], ["true_displacement_scaled"])
-    keys = [*HighestSPL.default_in_keys]
-    keys[1] = "true_leg" if config.drift else "leg"
-    highest = HighestSPL(keys)
-    privileged = [TrueDisplacement(), scaled_displacement, highest, SPLReward(), RewardSum(["reward"])]
+    efficiency = SPLReward(["highest_spl", "step_price"])
+    privileged = [TrueDisplacement(), scaled_displacement, HighestSPL(), efficiency, RewardSum(["reward"])]
     for transform in (TrackField(rules, known), *declaration, MinMaxNorm(in_keys_inv=["action"]), *privileged):
         env.append_transform(transform)
     return env
@@ -169,7 +168,7 @@ def evaluation_env(scenario: Scenario, num_trips: int, seed: int, config: Config
     """Return an environment of random trips of a scenario, drawn once, with the noise of the sensors."""
     trips = scenario.random_trips(num_trips, seed)
     base = GeomagneticNavEnv(scenario.with_trips(trips), num_envs=num_trips, seed=seed, **options)
-    return TransformedEnv(base, Compose(*errors(config, seed)))
+    return TransformedEnv(base, Compose(*spl_reward(), *errors(config, seed)))
 
 
 def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> TensorDictSequential:

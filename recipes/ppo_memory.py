@@ -68,8 +68,6 @@ class Config(PlanetConfig):
     critic_cells: Widths = (128, 128)
     eval_trips_small: Count = 500
 
-    step_price: Positive = 0.5
-    """Price of a step in the reward [% of SPL]."""
     memory_size: Count = 128
     """Width of the memory."""
     memory_batches: Count = 20
@@ -84,9 +82,7 @@ PRESETS = make_presets(Config, TABLES)
 def make_env(config: Config) -> TransformedEnv:
     """Return the task on random planets with an empty memory, and the privileged inputs of critic and reward."""
     planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
-    env = task_env(
-        planets, config, num_envs=config.num_envs, seed=config.seed, reward="spl", step_price=config.step_price
-    )
+    env = task_env(planets, config, num_envs=config.num_envs, seed=config.seed)
     scaled_displacement = ObservationNorm(0.0, 1 / 200, ["true_displacement"], ["true_displacement_scaled"])
     memory = TensorDictPrimer({"hidden": Unbounded((1, config.memory_size))}, expand_specs=True)
     for transform in (InitTracker(), memory, scaled_displacement, RewardSum(["reward"])):

@@ -4,7 +4,7 @@
     python recipes/sweep.py td3_gradient_guided.py --command mine='python mine.py' -- --task box
 
 An algorithm is a command that takes --task, --seed and --out, and leaves policy.safetensors or policy.onnx in the
-folder --out. Columns `frames` and `eval_spl` [%] of a file train.csv there are its learning curve. What follows -- is
+folder --out. Columns `frames` and `eval_score` [%] of a file train.csv there are its learning curve. What follows -- is
 given to each command. Commands have one thread each, and WANDB_RUN_GROUP is the name of the sweep.
 
 The same command resumes a sweep: runs that have ended are not repeated, and those of magrl.training.Run go on from
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from magrl.evaluation.episodes import episode_measures, returns
+from magrl.evaluation.episodes import episode_measures, episode_scores
 from magrl.evaluation.scores import flown
 from magrl.evaluation.tables import markdown_table, mean_of_runs
 from magrl.evaluation.tracks import write_episodes
@@ -133,8 +133,8 @@ def run(job: Job) -> DataFrame:
             raise UsageError(f"{job.folder.name}: {job.line!r} {left}")
         rollout = flown(job.folder, job.task, episodes=EPISODES)
         measures = episode_measures(rollout)
-        columns = {"episode": range(EPISODES), "success": measures["success"].int(), "SPL": measures["spl"]}
-        rows = job.rows(columns | {"return": returns(rollout), "steps": measures["steps"]})
+        columns = {"episode": range(EPISODES), "score": episode_scores(rollout), "success": measures["success"].int()}
+        rows = job.rows(columns | {"SPL": measures["spl"], "steps": measures["steps"]})
         write_episodes(scores, [rows])
     return read_csv(scores)
 
@@ -156,15 +156,15 @@ def sweep(runs: Sequence[Job], **options: Any) -> DataFrame:
 
 def curves(jobs: Sequence[Job]) -> DataFrame:
     """Return the points of learning curves: the evaluations in the train.csv of each job."""
-    names = ["frames", "eval_success_rate", "eval_spl"]
+    names = ["frames", "eval_score", "eval_success_rate", "eval_spl"]
     paths = {job: path for job in jobs if (path := job.folder / "train.csv").is_file()}
     known = [job.rows(read_csv(path).reindex(columns=names)) for job, path in paths.items()]
-    return concat(known).dropna(subset=names[::2]) if known else DataFrame(columns=["agent"])
+    return concat(known).dropna(subset=names[:2]) if known else DataFrame(columns=["agent"])
 
 
 def table(episodes: DataFrame) -> str:
     """Return the Markdown table of a sweep: a row for each seed, and interquartile means with intervals over seeds."""
-    labels = {"success": "SR %", "SPL": "SPL %", "return": "return", "steps": "steps"}
+    labels = {"score": "score %", "success": "SR %", "SPL": "SPL %", "steps": "steps"}
     runs = episodes.groupby(["agent", "seed"], sort=False)[list(labels)].mean()
     runs[["success", "SPL"]] *= 100
     rows = []
@@ -179,7 +179,7 @@ def figure(points: DataFrame) -> Figure:
     drawn = Figure(figsize=(6, 4), layout="constrained")
     axes = drawn.subplots()
     for number, (agent, runs) in enumerate(points.groupby("agent", sort=False)):
-        draw_seeds(axes, runs, "frames", "eval_spl", color=f"C{number}", label=agent)
+        draw_seeds(axes, runs, "frames", "eval_score", color=f"C{number}", label=agent)
     axes.set(xlabel="frames (vehicle-steps)", ylabel="SPL [%]", ylim=(0, 102))
     drawn.legend(loc="outside lower center", ncols=3)
     return drawn

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.envs.navigation import guidance
+from magrl.envs.navigation import guidance, spl_reward
 from magrl.envs.scenario import rule_settings
 from magrl.envs.specs import REWARD_TERMS
 from magrl.errors import SensorErrors
@@ -28,7 +28,7 @@ from magrl.navigators import FieldPolicy, PolicyConfig, make_critic
 from magrl.training import Run, SoftUpdate, TD3Loss, command, optimize, parse_config, saturation_penalty
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
-from magrl.transforms import DistanceCost, EpisodeSum, ProgressReward, TrueDisplacement
+from magrl.transforms import DistanceCost, EpisodeSum
 
 import torch
 from pydantic import Field, model_validator
@@ -47,7 +47,7 @@ CONSTANT = {f"final_{name}": paper.TABLE_1[name] for name in ("learning_rate", "
 TABLES = read_presets(__file__, table_1=paper.TABLE_1 | CONSTANT)
 TASKS = tuple(dict.fromkeys(table["task"] for table in TABLES.values()))
 UNIT = 20.0
-"""Reward of the paper for a reward of 1 for progress: 200 at the arrival."""
+"""Reward of the paper for a reward of 1 of the task: 200 for an arrival by the shortest path."""
 
 
 class Config(rule_settings("start_heading"), RegionConfig):
@@ -57,14 +57,14 @@ class Config(rule_settings("start_heading"), RegionConfig):
     """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance; or for a task."""
     task: Literal[*TASKS] = TASKS[0]  # type: ignore[valid-type]
     """Named task (docs/tasks.md)."""
-    reward: Literal["base", "progress"] = "base"
-    """Reward: the paper's without its alignment, or for progress to the destination, with 200 at the arrival, too."""
+    reward: Literal["base", "spl"] = "base"
+    """Reward of the training: the paper's without its alignment, or the task's in the paper's unit."""
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
 
     # Environment
     distance_cost: NonNegative = 0.0
-    """Cost of a leg [1/km]; none in the paper."""
+    """Cost of a leg [1/km] in the reward base; none in the paper."""
     objective_limit: Positive | None = None
     """Upper bound on the objective in the proximity reward; 10 in preset paper."""
     time_limit_ends: bool = False
@@ -127,18 +127,16 @@ class Config(rule_settings("start_heading"), RegionConfig):
 PRESETS = make_presets(Config, TABLES)
 
 
-def rewards(base: GeomagneticNavEnv, config: Config, *, training: bool = False) -> list[Transform]:
-    """Return the transforms of the reward; in training, with guidance, cost of the distance, sums, and scale."""
-    progress = [TrueDisplacement(), ProgressReward(), RewardScaling(0.0, UNIT)] if config.reward == "progress" else []
-    if not training:
-        return progress
+def rewards(base: GeomagneticNavEnv, config: Config) -> list[Transform]:
+    """Return the transforms of the reward of the training, with guidance, cost of the distance, sums, and scale."""
+    task = [*spl_reward(), RewardScaling(0.0, UNIT)] if config.reward == "spl" else []
     keys = ["reward", "reward_alignment"]
     alignment = {"weight": config.alignment_weight, "offset": config.alignment_offset}
     guided = guidance(base, out_keys=keys, **alignment) if config.guided else []
-    terms = [*(() if progress else REWARD_TERMS), *(keys[1:] if guided else ())]
+    terms = [*(() if task else REWARD_TERMS), *(keys[1:] if guided else ())]
     sums = [RewardSum(), *([EpisodeSum(terms)] if terms else [])]
-    scaled = [DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    return [*progress, *guided, *sums, *scaled]
+    cost = [] if task else [DistanceCost(config.distance_cost)]
+    return [*task, *guided, *sums, *cost, RewardScaling(loc=0.0, scale=config.reward_scale)]
 
 
 def make_env(scenario: Scenario, config: Config) -> TransformedEnv:
@@ -147,7 +145,7 @@ def make_env(scenario: Scenario, config: Config) -> TransformedEnv:
         config.num_envs,
         scenario=scenario,
         seed=config.seed,
-        reward=partial(rewards, config=config, training=True),
+        reward=partial(rewards, config=config),
         transforms=[SensorErrors(config.noise, seed=config.seed)] if any(config.noise) else [],
         **config.options,
         **config.model_dump(include={"observe_heading", "observe_difference"}),
@@ -184,8 +182,8 @@ def train(config: Config) -> dict[str, float]:
     name += f"-{config.task}" if config.task != PRESETS[config.preset].task else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        env, reward = make_env(run.scenario.with_trips(None), config), partial(rewards, config=config)
-        validation, test = run.evaluation_envs(NAMED_TASKS[config.task].make, reward=reward, **config.options)
+        env = make_env(run.scenario.with_trips(None), config)
+        validation, test = run.evaluation_envs(NAMED_TASKS[config.task].make, **config.options)
 
         # Networks
         network = PolicyConfig(env.view, config.num_cells, config.layer_norm)

@@ -11,7 +11,6 @@ from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.regions import PAPER_REGION
 from magrl.pilot import Rules
-from magrl.pilot.planning import STEP_PRICE
 from magrl.transforms import (
     AlignmentReward,
     FieldGradient,
@@ -19,8 +18,6 @@ from magrl.transforms import (
     HighestSPL,
     LegsView,
     MinMaxNorm,
-    ProgressReward,
-    RandomStepPrice,
     ReadingObservation,
     SPLReward,
     TrackField,
@@ -30,7 +27,7 @@ from magrl.transforms.sequences import ACCURACY_KEYS
 from magrl.transforms.track import known_keys
 
 OBSERVATIONS = ("flat", "legs", "track", "readings", "dict")
-REWARDS = ("progress", "paper", "base", "spl")
+REWARDS = ("spl", "paper", "base")
 Reward = Callable[[GeomagneticNavEnv], Sequence[Transform]]
 
 
@@ -38,8 +35,7 @@ def navigation_env(
     num_envs: int = 1,
     *,
     observation: str | Sequence[str] = "flat",
-    reward: str | Reward = "progress",
-    step_price: float = STEP_PRICE,
+    reward: str | Reward = "spl",
     transforms: Sequence[Transform] = (),
     scale_actions: bool = True,
     observe_heading: bool = True,
@@ -58,14 +54,12 @@ def navigation_env(
             keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view of
             ``"flat"`` and of ``"legs"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
         transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
-        reward: ``"progress"``, the default, is :class:`~magrl.transforms.ProgressReward`: kilometers nearer to the
-            destination over 50, plus 10 at the arrival, minus 0.1 a step. ``"paper"`` is the paper's: decrease of the
-            objective, 200 at the arrival, and alignment with the theoretical heading by the true field, outside
-            the paper's region by the pair of elements that crosses best. It has a trap: to stand still and turn to that
-            heading earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
-            :class:`~magrl.transforms.SPLReward`, in which each step costs ``step_price``. A function of the plain
-            environment returns the transforms of another reward.
-        step_price: price of a step of that reward [% of SPL].
+        reward: ``"spl"``, the default, is :class:`~magrl.transforms.SPLReward`: an episode that arrives earns 10 times
+            its SPL, a failure less than 5. ``"paper"`` is the paper's: decrease of the objective, 200 at the arrival,
+            and alignment with the theoretical heading by the true field, outside the paper's region by the pair of
+            elements that crosses best. It has a trap: to stand still and turn to that heading earns 117 in 50 steps.
+            ``"base"`` is that without the alignment. A function of the plain environment returns the transforms of
+            another reward.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         observe_heading: switch of the view of ``"flat"`` (:class:`~magrl.transforms.ObservationView`).
         observe_difference: another one.
@@ -88,7 +82,7 @@ def navigation_env(
     check_type(bool, scale_actions=scale_actions)
     check_type(Transform, **{f"transforms[{number}]": transform for number, transform in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
-    steps = reward(base) if callable(reward) else _named_reward(base, reward, step_price)
+    steps = reward(base) if callable(reward) else _named_reward(base, reward)
     env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))
     switches = {"observe_heading": observe_heading, "observe_difference": observe_difference}
     for transform in _observation(env, observation, **switches):
@@ -102,12 +96,20 @@ def navigation_env(
     return env
 
 
-def _named_reward(base: GeomagneticNavEnv, reward: str, step_price: float) -> list[Transform]:
-    if reward == "progress":
-        return [TrueDisplacement(), ProgressReward()]
+def _named_reward(base: GeomagneticNavEnv, reward: str) -> list[Transform]:
     if reward == "spl":
-        return [TrueDisplacement(), HighestSPL(), RandomStepPrice((step_price, step_price)), SPLReward()]
+        return spl_reward()
     return guidance(base) if reward == "paper" else []
+
+
+def spl_reward() -> list[Transform]:
+    """Return the transforms of the default reward; they come before errors of sensors.
+
+    Example:
+        >>> [type(step).__name__ for step in spl_reward()]
+        ['TrueDisplacement', 'HighestSPL', 'SPLReward']
+    """
+    return [TrueDisplacement(), HighestSPL(), SPLReward()]
 
 
 def guidance(base: GeomagneticNavEnv, **alignment: Any) -> list[Transform]:

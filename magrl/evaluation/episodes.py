@@ -220,16 +220,18 @@ def first_episode_mask(done: Tensor) -> Tensor:
     return done.long().cumsum(1) - done.long() == 0
 
 
-def returns(rollout: TensorDictBase) -> Tensor:
-    """Return the sum of the rewards ``(M,)`` in the first episode of each vehicle, of a rollout ``(M, T)``.
+def episode_scores(rollout: TensorDictBase) -> Tensor:
+    """Return the score ``(M,)`` of the first episode of each vehicle, of a rollout ``(M, T)``: 10 times its return [%].
+
+    With the default reward it is 100 SPL for an arrival, and below 50 for a failure.
 
     Example:
         >>> after = TensorDict(reward=torch.ones(1, 3, 1), done=torch.tensor([[[False], [True], [True]]]))
-        >>> returns(TensorDict(next=after, batch_size=[1, 3]))
-        tensor([2.])
+        >>> episode_scores(TensorDict(next=after, batch_size=[1, 3]))
+        tensor([20.], dtype=torch.float64)
     """
     after = rollout["next"]
-    return (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1)
+    return 10 * (after["reward"].squeeze(-1).double() * first_episode_mask(after["done"])).sum(1)
 
 
 def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:

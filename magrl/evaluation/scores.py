@@ -16,9 +16,9 @@ from torch import nn
 from torch.utils._pytree import tree_map
 
 from magrl.checks import check_float32, check_number, short
-from magrl.envs.measures import summarize
+from magrl.envs.measures import bootstrap_interval, summarize
 from magrl.evaluation.arrays import ArrayPolicy
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
+from magrl.evaluation.episodes import episode_measures, episode_scores, evaluation_rollout
 from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.navigators import Navigator
 from magrl.navigators.names import make_navigator, named
@@ -55,9 +55,10 @@ def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
         options: of its function in :mod:`magrl.named_tasks`. The score is then not the task's.
 
     Returns:
-        ``SR``, success rate [%]; ``SPL`` [%] with its bootstrap 95 % interval over episodes, ``SPL_low`` and
-        ``SPL_high``; ``return``, the mean return of the task's reward; ``steps``, their mean; ``beyond_50km``, share of
-        successes that end more than 50 km from the destination [%], NaN without a success.
+        ``score``, 10 times the mean return [%]: 100 SPL for each arrival, below 50 for a failure; ``SR``, success rate
+        [%]; ``SPL`` [%]; ``score_low``, ``score_high``, ``SPL_low`` and ``SPL_high``, bootstrap 95 % intervals over
+        episodes; ``steps``, their mean; ``beyond_50km``, share of successes that end more than 50 km from the
+        destination [%], NaN without a success.
 
     Raises:
         TypeError: for an agent of another kind.
@@ -91,12 +92,15 @@ def flown(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
 
 def scored(rollout: TensorDictBase) -> dict[str, float]:
     """Return the score of a rollout of :func:`flown`."""
-    measures = episode_measures(rollout)
+    measures, scores = episode_measures(rollout), episode_scores(rollout)
+    low, high = bootstrap_interval(scores)
     summary, far = summarize(measures), measures["navigation_error_km"][measures["success"]] > FAR_KM
     return {
+        "score": scores.mean().item(),
+        "score_low": low,
+        "score_high": high,
         "SR": summary["success_rate"],
         **{f"SPL{end}": summary[f"spl{end}"] for end in ("", "_low", "_high")},
-        "return": returns(rollout).mean().item(),
         "steps": measures["steps"].double().mean().item(),
         f"beyond_{FAR_KM}km": 100 * far.double().mean().item() if len(far) else math.nan,
     }

@@ -29,12 +29,13 @@ OpenLog = Callable[..., WandbRun]
 COUNTS = ("frames", "episodes", "iterations", "updates")
 RETURN_TERMS = ("destination", "proximity", "alignment")
 """Terms of the reward whose sums over an episode are reported beside the return."""
-LINES = ("#0072B2", "#D55E00", "#009E73")
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 TRAINING_PANELS = {
     "return": {"return": "return"},
     "return by term": {f"return_{term}": term for term in RETURN_TERMS},
-    "success [%]": {
+    "score [%]": {
         "success_rate": "SR, last 200 episodes",
+        "eval_score": "score, evaluation",
         "eval_success_rate": "SR, evaluation",
         "eval_spl": "SPL, evaluation",
     },
@@ -146,24 +147,6 @@ class BestPolicy:
         self.score, self.weights = state_dict["score"], state_dict["weights"]
 
 
-def selection_score(spl: float, success: Tensor, steps: Tensor, max_steps: int) -> float:
-    """Return the score by which the policy of a training is selected: SPL [%] minus the mean number of steps.
-
-    A failed episode counts ``max_steps`` steps, however early it ended, so that failing is never worth a step.
-
-    Args:
-        spl: success weighted by path length [%].
-        success: ``(M,)`` bool.
-        steps: ``(M,)`` steps of each episode.
-        max_steps: step limit of an episode.
-
-    Example:
-        >>> selection_score(50.0, torch.tensor([True, False]), torch.tensor([10, 3]), max_steps=50)
-        20.0
-    """
-    return spl - torch.where(success, steps, max_steps).double().mean().item()
-
-
 class RunLog:
     """Curves and results of a run, written to its folder and to wandb.
 
@@ -246,7 +229,7 @@ class RunLog:
 
 
 def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
-    """Return the curves of one training: return, return by term, success rate and SPL, losses.
+    """Return the curves of one training: return, return by term, score, success rate and SPL, losses.
 
     Args:
         rows: rows of a ``train.csv``; missing values and NaN are left out.
@@ -254,7 +237,7 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
     Example:
         >>> rows = [{"frames": 1000, "return": -5.0}, {"frames": 2000, "return": 20.0, "success_rate": 10.0}]
         >>> [axes.get_title() for axes in training_figure(rows).axes]
-        ['return', 'return by term', 'success [%]', 'loss']
+        ['return', 'return by term', 'score [%]', 'loss']
     """
     figure = library("matplotlib.figure", "plots").Figure(figsize=(10, 7), layout="constrained")
     frames = np.array([row["frames"] for row in rows])
@@ -286,8 +269,8 @@ def draw_seeds(axes: Axes, runs: DataFrame, along: str, value: str, **look: Any)
     Example:
         >>> from matplotlib.figure import Figure
         >>> from pandas import DataFrame
-        >>> runs = DataFrame({"seed": [0, 1, 2], "frames": 512, "eval_spl": [90.0, 99.0, 94.0]})
-        >>> draw_seeds(axes := Figure().subplots(), runs, "frames", "eval_spl", color="C0")
+        >>> runs = DataFrame({"seed": [0, 1, 2], "frames": 512, "eval_score": [90.0, 99.0, 94.0]})
+        >>> draw_seeds(axes := Figure().subplots(), runs, "frames", "eval_score", color="C0")
         >>> axes.lines[0].get_xydata().tolist()
         [[512.0, 94.0]]
     """

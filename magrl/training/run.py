@@ -29,7 +29,7 @@ from magrl.commands import UsageError
 from magrl.envs import GeomagneticNavEnv, Scenario, Trips
 from magrl.envs.measures import summarize
 from magrl.errors import SensorErrors
-from magrl.evaluation.episodes import episode_measures, evaluation_rollout, returns
+from magrl.evaluation.episodes import episode_measures, episode_scores, evaluation_rollout
 from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere, FieldPolicy, save_policy
 from magrl.random_numbers import TEST_SEED, VALIDATION_SEED
@@ -37,11 +37,11 @@ from magrl.sensor_std import PERFECT, Noise
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.collectors import LostCollectorError, RemoteCollector
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RegionConfig, RunConfig
-from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score, training_figure
+from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, training_figure
 from magrl.training.wandb_run import WandbRun
 
-EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km", "return")
-"""Measures of the validation trips in ``train.csv``, with the prefix ``eval_``; their return has no guidance."""
+EVALUATED = ("score", "success_rate", "spl", "steps", "navigation_error_km")
+"""Measures of the validation trips in ``train.csv``, with the prefix ``eval_``; the policy is selected by the first."""
 SHARED = ("guided", "task", "scenario", "zeta", "start_heading", "noise")
 """Settings that the file of the policy holds, for evaluations."""
 
@@ -293,15 +293,11 @@ class Run:
 
     def _evaluate(self) -> str:
         """Evaluate on the validation trips, keep the best policy, add a row of curves; return a short report."""
-        rollout = evaluation_rollout(self.validation, self.policy)
-        episodes = episode_measures(rollout)
-        summary = summarize(episodes) | {"return": returns(rollout).mean().item()}
-        score = selection_score(summary["spl"], episodes["success"], episodes["steps"], self.validation.max_steps)
-        self.best.offer(score, self._network)
+        summary = _summary(evaluation_rollout(self.validation, self.policy))
+        self.best.offer(summary["score"], self._network)
         row = self.statistics.row() | {"seconds": self.log.seconds}
         self.log.row(row | {f"eval_{key}": summary[key] for key in EVALUATED})
-        earned = f"{row['return']:.0f}" if math.isfinite(row["return"]) else "not known yet"
-        return f"SR {summary['success_rate']:.1f} %, SPL {summary['spl']:.1f} %, return {earned}"
+        return f"score {summary['score']:.1f} %, SR {summary['success_rate']:.1f} %, SPL {summary['spl']:.1f} %"
 
     # Results
 
@@ -327,7 +323,7 @@ class Run:
         if not self.complete:
             self._report_stop()
         rollout = evaluation_rollout(test, self.policy)
-        result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "trips_seed": TEST_SEED}
+        result = _summary(rollout) | {"seed": self.config.seed, "trips_seed": TEST_SEED}
         result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
         result["training_seconds"] = seconds
         if len(test.region) == 1:
@@ -368,3 +364,7 @@ class Run:
                 "increase total_frames (and total_episodes), or reduce batch_size",
                 file=sys.stderr,
             )
+
+
+def _summary(rollout: TensorDictBase) -> dict[str, float]:
+    return {"score": episode_scores(rollout).mean().item()} | summarize(episode_measures(rollout))

@@ -14,7 +14,6 @@ from magrl.transforms.legs import RecentLegs as RecentLegs
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import EpisodeSum as EpisodeSum
 from magrl.transforms.rewards import HighestSPL as HighestSPL
-from magrl.transforms.rewards import ProgressReward as ProgressReward
 from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice
 from magrl.transforms.rewards import SPLReward as SPLReward
 from magrl.transforms.rewards import TrueDisplacement as TrueDisplacement

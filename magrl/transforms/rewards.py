@@ -19,8 +19,6 @@ from magrl.transforms.episode import Episode, EpisodeNumbers
 
 SPL_REWARD = 10.0
 """Reward for an SPL of 1."""
-UNIT_KM, ARRIVAL, PRICE = 50.0, 10.0, 0.1
-"""Distance of a reward of 1 [km], the longest leg by default; reward for the arrival; price of a step."""
 
 
 class TrueDisplacement(ObservationTransform):
@@ -58,16 +56,65 @@ class TrueDisplacement(ObservationTransform):
         return observation_spec
 
 
-class ProgressReward(StepReward):
-    """Write the reward for getting nearer to the destination, for the arrival, and minus the price of a step.
+class HighestSPL(StatefulTransform):
+    """Write the highest SPL (success weighted by path length) in reach, and what is earned of it. Privileged.
 
-    The first term is ``gamma * phi(after) - phi(before)`` with ``gamma`` 1 and the potential ``phi`` of minus the
-    distance, which leaves the optimal policy without discount unchanged: a detour and the return add up to 0. An
-    episode of up to 90 steps earns less than any arrival at the same destination if it ends without one. It replaces
-    the reward of the environment. Privileged.
+    The highest SPL is that of the straight path from the present position: the distance of the trip over the path so
+    far plus the true displacement. After an arrival it is the SPL of the episode, after any other end 0. Earned is the
+    SPL at an arrival. Before one, and at any other end, it is half of the share of the trip that is made times the
+    highest SPL in reach: negative where the vehicle is farther than the trip is long, and 0 at the start.
 
     Args:
-        in_keys: true displacement ``(..., 2)`` [km], and the flag success ``(..., 1)``.
+        in_keys: true displacement ``(..., 2)`` [km], last leg ``(..., K)`` with the distance [km] first, start position
+            and target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and done.
+        out_keys: the highest SPL ``(..., 1)`` in [0, 1], the earned one ``(..., 1)``, and the path as commanded
+            ``(..., 1)`` [km], which is the state.
+
+    Raises:
+        ValueError: for another number of keys.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueDisplacement(), HighestSPL()))
+        >>> after = env.rollout(3)["next"]
+        >>> bool((after["earned_spl"] < after["highest_spl"] / 2).all())
+        True
+    """
+
+    default_in_keys = ("true_displacement", "leg", "start_position", "target_position", "success", "done")
+    default_out_keys = ("highest_spl", "earned_spl", "path_km")
+    out_sizes = dict.fromkeys(default_out_keys, (1,))
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the path."""
+        return self.out_keys[2:]
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        one = torch.ones_like(values[0][..., :1])
+        self._write_named(tensordict, highest_spl=one, earned_spl=0 * one, path_km=0 * one)
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        after = self._named(values)
+        start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
+        trip_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
+        path_km, left_km = state[0] + after["leg"][..., :1], after["true_displacement"].norm(dim=-1, keepdim=True)
+        reach = trip_km / torch.maximum(torch.where(success, path_km, path_km + left_km), trip_km)
+        earned = torch.where(success, reach, 0.5 * (1 - left_km / trip_km) * reach)
+        highest = reach.masked_fill(after["done"] & ~success, 0.0)
+        self._write_named(tensordict, highest_spl=highest, earned_spl=earned, path_km=path_km)
+
+
+class SPLReward(StepReward):
+    """Write 10 times the change of what is earned of the SPL (:class:`HighestSPL`). Privileged.
+
+    The rewards of an episode add up to 10 times its SPL if it arrives, and to less than 5 if it fails. They are changes
+    of a potential, so that a detour and the return earn nothing. It replaces the reward of the environment.
+
+    Args:
+        in_keys: what is earned ``(..., 1)``; and the price of a step ``(..., 1)`` [% of SPL], which may be left out.
+            ``"highest_spl"`` as the first one gives rewards for efficiency alone, whose sum is less by 10.
         out_keys: one reward ``(..., 1)``.
 
     Raises:
@@ -78,96 +125,22 @@ class ProgressReward(StepReward):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> after = TensorDict(true_displacement=torch.tensor([30.0, 40.0]), success=torch.tensor([True]))
-        >>> ProgressReward()(TensorDict(true_displacement=torch.tensor([60.0, 80.0]), next=after))["next", "reward"]
-        tensor([10.9000])
+        >>> after = TensorDict(earned_spl=torch.tensor([0.375]))
+        >>> SPLReward()(TensorDict(earned_spl=torch.tensor([0.25]), next=after))["next", "reward"]
+        tensor([1.2500])
     """
 
-    default_in_keys = ("true_displacement", "success")
+    default_in_keys = ("earned_spl",)
+    optional_in_keys = ("step_price",)
 
     @property
     def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the true displacement."""
+        """Keys that a step reads from the TensorDict before it: what is earned."""
         return self.in_keys[:1]
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        nearer_km = state[0].norm(dim=-1, keepdim=True) - values[0].norm(dim=-1, keepdim=True)
-        tensordict.set(self.out_keys[0], nearer_km / UNIT_KM + ARRIVAL * values[1].to(nearer_km) - PRICE)
-
-
-class HighestSPL(StatefulTransform):
-    """Write the highest SPL (success weighted by path length) that an episode can still reach. Privileged.
-
-    It is the SPL of the straight path from the present position: the distance of the trip over the path so far plus the
-    true displacement. After an arrival it is the SPL of the episode, after any other end 0.
-
-    Args:
-        in_keys: true displacement ``(..., 2)`` [km], last leg ``(..., K)`` with the distance [km] first, start position
-            and target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and done.
-        out_keys: one number ``(..., 1)`` in [0, 1], which is also the state.
-
-    Raises:
-        ValueError: for another number of keys.
-
-    Example:
-        >>> from magrl.envs import GeomagneticNavEnv
-        >>> from torchrl.envs import Compose, TransformedEnv
-        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueDisplacement(), HighestSPL()))
-        >>> bool((env.rollout(3)["next", "highest_spl"] < 1).all())
-        True
-    """
-
-    default_in_keys = ("true_displacement", "leg", "start_position", "target_position", "success", "done")
-    default_out_keys = ("highest_spl",)
-    out_sizes = {"highest_spl": (1,)}
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the true displacement and the number itself."""
-        return [self.in_keys[0], self.out_keys[0]]
-
-    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        tensordict.set(self.out_keys[0], torch.ones_like(values[0][..., :1]))
-
-    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        after, (before, highest) = self._named(values), state
-        start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
-        trip_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
-        path_km = trip_km / highest - before.norm(dim=-1, keepdim=True) + after["leg"][..., :1]
-        whole_km = torch.where(success, path_km, path_km + after["true_displacement"].norm(dim=-1, keepdim=True))
-        reached = trip_km / torch.maximum(whole_km, trip_km)
-        tensordict.set(self.out_keys[0], torch.where(after["done"] & ~success, torch.zeros_like(reached), reached))
-
-
-class SPLReward(StepReward):
-    """Write the change of :class:`HighestSPL` minus the price of a step: the return of an episode is its SPL.
-
-    It is 10 times SPL minus 1, minus a tenth of the prices of its steps. It replaces the reward of
-    the environment. Privileged.
-
-    Args:
-        in_keys: highest SPL ``(..., 1)`` and price of a step ``(..., 1)`` [% of SPL].
-        out_keys: one reward ``(..., 1)``.
-
-    Raises:
-        ValueError: for another number of keys.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> after = TensorDict(highest_spl=torch.tensor([0.9]), step_price=torch.tensor([0.5]))
-        >>> SPLReward()(TensorDict(highest_spl=torch.tensor([1.0]), next=after))["next", "reward"]
-        tensor([-1.0500])
-    """
-
-    default_in_keys = ("highest_spl", "step_price")
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the highest SPL."""
-        return self.in_keys[:1]
-
-    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        tensordict.set(self.out_keys[0], SPL_REWARD * (values[0] - state[0] - values[1] / 100))
+        change = values[0] - state[0]
+        tensordict.set(self.out_keys[0], SPL_REWARD * (change - sum(values[1:]) / 100))
 
 
 class RandomStepPrice(EpisodeNumbers):
