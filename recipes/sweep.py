@@ -180,7 +180,7 @@ def figure(points: DataFrame) -> Figure:
     axes = drawn.subplots()
     for number, (agent, runs) in enumerate(points.groupby("agent", sort=False)):
         draw_seeds(axes, runs, "frames", "eval_score", color=f"C{number}", label=agent)
-    axes.set(xlabel="frames (vehicle-steps)", ylabel="SPL [%]", ylim=(0, 102))
+    axes.set(xlabel="frames (vehicle-steps)", ylabel="score [%]", ylim=(0, 102))
     drawn.legend(loc="outside lower center", ncols=3)
     return drawn
 

@@ -82,7 +82,7 @@ def make_envs(config: Config, noise: Noise) -> tuple[GeomagneticNavVectorEnv, st
     region: dict[str, Any] = {"distance_range_km": config.distance_range_km, "max_latitude": 70.0}
     region |= {"start_heading": "random", "max_steps": config.max_steps}
     scenario = SCENARIOS[config.field](config.regions, config.seed, **region)
-    options: dict[str, Any] = {"observation": "dict", "reward": "spl", "scale_actions": False, "seed": config.seed}
+    options: dict[str, Any] = {"observation": "dict", "scale_actions": False, "seed": config.seed}
     errors = [SensorErrors(noise)]
     envs = GeomagneticNavVectorEnv(config.episodes, task="anywhere", scenario=scenario, transforms=errors, **options)
     parts = f"scenario=magrl.envs.{config.field}_scenario({config.regions}, {config.seed}, **{region})"

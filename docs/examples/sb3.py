@@ -90,7 +90,8 @@ class Curve(BaseCallback):
     def point(self) -> dict[str, float]:
         """Add a point; return the score."""
         scores = score(self.model, self.config.task, episodes=self.config.episodes)
-        self.rows.append({"frames": self.num_timesteps, "eval_success_rate": scores["SR"], "eval_spl": scores["SPL"]})
+        names = {"score": "eval_score", "SR": "eval_success_rate", "SPL": "eval_spl"}
+        self.rows.append({"frames": self.num_timesteps, **{name: scores[key] for key, name in names.items()}})
         DataFrame(self.rows).to_csv(self.config.out / "train.csv", index=False)
         return scores
 

@@ -25,7 +25,7 @@ EPISODES = 200
 
 
 def keep_agents(ends: Iterable[tuple[tuple[str, str], DataFrame]], runs: Path, folder: Path) -> None:
-    """Copy the agent of the run with the median SPL of each algorithm on each task, if it is there.
+    """Copy the agent of the run with the median score of each algorithm on each task, if it is there.
 
     Args:
         ends: task and algorithm, and the last points of their runs.
@@ -34,7 +34,7 @@ def keep_agents(ends: Iterable[tuple[tuple[str, str], DataFrame]], runs: Path, f
     """
     folder.mkdir(exist_ok=True)
     for (task, name), last in ends:
-        seed = last.sort_values("SPL")["seed"].iloc[(len(last) - 1) // 2]
+        seed = last.sort_values("score")["seed"].iloc[(len(last) - 1) // 2]
         for agent in (runs / f"{task}-{name}-seed{seed}").glob("policy.*"):
             content = agent.read_bytes()
             if agent.suffix == ".onnx" and not has_view(content):
@@ -48,9 +48,9 @@ def main(files: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     for file in files:
         task, _, name = file.stem.partition("-")
         found = {key: f"{value:.1f}" for key, value in score(file, task, episodes=EPISODES).items()}
-        interval = f"{found['SPL']} ({found['SPL_low']}–{found['SPL_high']})"
-        rows.append([task, name, found["SR"], interval, found["return"], found["steps"], found["beyond_50km"]])
-    print(markdown_table(["task", "agent", "SR %", "SPL %", "return", "steps", "beyond 50 km %"], rows))
+        interval = f"{found['score']} ({found['score_low']}–{found['score_high']})"
+        rows.append([task, name, interval, *(found[key] for key in ("SR", "SPL", "steps", "beyond_50km"))])
+    print(markdown_table(["task", "agent", "score %", "SR %", "SPL %", "steps", "beyond 50 km %"], rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Bars of the named tasks: what navigators without training reach on the first episode of 1000 vehicles.
 
-    python docs/tables/bars.py    # half an hour; prints them with their returns and CPU time
+    python docs/tables/bars.py    # half an hour; prints them with their CPU time
 
 The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 1000 vehicles starts the same episodes. Oracles are
 the true bearing, which knows where vehicle and destination are, the shortest paths around no-go areas, all or those
@@ -39,7 +39,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 VEHICLES, FEWER = 1000, {"estimated": 200}
-COLUMNS = ("SR", "SPL", "steps", "return", "ms")
+COLUMNS = ("score", "SR", "SPL", "steps", "ms")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
 BARS |= {"memory": "memory (pretrained)"}
 BARS |= {"told": "kalman, which knows the size of each error"}
@@ -199,7 +199,7 @@ def main() -> None:
         for task in NAMED_TASKS
         for name in bars_of(task)
     ]
-    print(markdown_table(["task", "navigator", "SR [%]", "SPL [%]", "steps", "return", "CPU a step [ms]"], rows))
+    print(markdown_table(["task", "navigator", "score [%]", "SR [%]", "SPL [%]", "steps", "CPU a step [ms]"], rows))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@
 
 algorithms.toml has the command of each algorithm for each task, which recipes/sweep.py runs, scores and resumes. The
 rows of a run replace those of the same task, algorithm and seed in docs/results/scores.csv. The agent of the run with
-the median SPL is kept in docs/results/agents, for agents.py.
+the median score is kept in docs/results/agents, for agents.py.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ from sweep import Job, curves, named_commands, sweep
 
 ALGORITHMS = read_document(Path(__file__).with_name("algorithms.toml"))
 RUN = ["task", "algorithm", "seed"]
-COLUMNS = [*RUN, "steps", "cpu_s", "SR", "SPL", "return"]
+MEASURES = {"score": "eval_score", "SR": "eval_success_rate", "SPL": "eval_spl"}
+"""Measures [%], and their columns of learning curves."""
+COLUMNS = [*RUN, "steps", "cpu_s", *MEASURES]
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 COLORS = dict(zip(ALGORITHMS, OKABE_ITO, strict=False))
 """Colors of algorithms."""
@@ -88,10 +90,10 @@ def planned(config: Config) -> list[Job]:
 
 def rows_of(job: Job, episodes: DataFrame) -> DataFrame:
     """Return the rows of a run: its learning curve, and its score as the last point."""
-    points = curves([job]).rename(columns={"frames": "steps", "eval_success_rate": "SR", "eval_spl": "SPL"})
-    mean = episodes[["success", "SPL", "return"]].mean()
+    points = curves([job]).rename(columns={"frames": "steps", **{there: here for here, there in MEASURES.items()}})
+    mean = episodes[["score", "success", "SPL"]].mean()
     last = {"steps": points["steps"].max() if len(points) else math.nan, "cpu_s": cpu_s(job)}
-    last |= {"SR": 100 * mean["success"], "SPL": 100 * mean["SPL"], "return": mean["return"]}
+    last |= {"score": mean["score"], "SR": 100 * mean["success"], "SPL": 100 * mean["SPL"]}
     rows = concat([points, DataFrame([last])]).assign(task=job.task, algorithm=job.agent, seed=job.seed)
     return rows.reindex(columns=COLUMNS).round(2)
 
@@ -126,24 +128,22 @@ def ends(curves: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:
 
 
 def table(curves: DataFrame) -> str:
-    """Return the Markdown table of final scores and of the bars: interquartile means, with intervals over seeds."""
+    """Return the Markdown table of final scores, interquartile means with intervals over seeds, and of the bars."""
     rows = []
     for (task, name), runs in ends(curves):
         about = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k", f"{runs['cpu_s'].median() / 60:.1f} min"
-        earned = f"{runs['return'].median():.1f}"
-        about = [text.replace("nan min", "—").replace("nan", "—") for text in (*about, earned)]
-        rate, spl = mean_of_runs(runs["SR"], form=".1f", interval=False), mean_of_runs(runs["SPL"], form=".1f", least=2)
-        rows.append([task, name, *about, rate, spl])
+        about = [text.replace("nan min", "—").replace("nan", "—") for text in about]
+        rows.append([task, name, *about, *(mean_of_runs(runs[key], form=".1f", least=2) for key in MEASURES)])
     for task in curves["task"].unique():
         for name in bars_of(task):
             scores = bar(task, name)
-            rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in ("return", "SR", "SPL"))])
+            rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in MEASURES)])
     rows.sort(key=lambda row: list(NAMED_TASKS).index(row[0]))
-    return markdown_table(["task", "agent", "seeds × steps", "CPU", "return", "SR %", "SPL %"], rows)
+    return markdown_table(["task", "agent", "seeds × steps", "CPU", *(f"{key} %" for key in MEASURES)], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
-    """Return SPL over steps and over CPU time: medians over seeds, bands from the least to the highest, and the bars.
+    """Return scores over steps and over CPU time: medians over seeds, bands from the least to the highest, and bars.
 
     The last point of a run, its score, is left out: it is of other episodes.
     """
@@ -155,14 +155,14 @@ def figure(curves: DataFrame) -> Figure:
             points = runs.assign(cpu=cpu_minutes(runs))
             points = points[points.duplicated("seed", keep="last")]
             for axes, along in zip(both, ("steps", "cpu"), strict=True):
-                draw_seeds(axes, points, along, "SPL", color=COLORS.get(name, "black"), label=name)
+                draw_seeds(axes, points, along, "score", color=COLORS.get(name, "black"), label=name)
         for name in bars_of(task)[::-1]:  # oracle first
             look = {"color": "gray", "ls": STYLES[name], "lw": 1, "label": BARS[name].partition(" (")[0]}
             for axes in both:
-                axes.axhline(bar(task, name)["SPL"], **look)
+                axes.axhline(bar(task, name)["score"], **look)
         for axes, text in zip(both, ("steps", "CPU time [min]"), strict=True):
             axes.set(xscale="log", xlabel=text, ylim=(0, 102))
-        both[0].set_ylabel("SPL [%]")
+        both[0].set_ylabel("score [%]")
         part.suptitle(task)
         part.legend(*both[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
     return drawn

@@ -370,17 +370,17 @@ def test_stable_baselines3_example(tmp_path: Path, monkeypatch) -> None:
     run = tmp_path / "nogo-SAC-seed0"
     result = example.main(example.Config("sac", "nogo", **small, out=run))
     load("docs/tables/agents").keep_agents(
-        [(("nogo", "SAC"), DataFrame({"seed": [0], "SPL": [1]}))], tmp_path, tmp_path
+        [(("nogo", "SAC"), DataFrame({"seed": [0], "score": [1]}))], tmp_path, tmp_path
     )
     assert b"docs/examples" in (run / "policy.onnx").read_bytes()
     assert b"docs/examples" not in (tmp_path / "nogo-SAC.onnx").read_bytes()
     for path in (run / "policy.onnx", tmp_path / "nogo-SAC.onnx"):
         saved = score(path, "nogo", episodes=4, max_steps=5)
-        assert result["return"] == pytest.approx(saved["return"], abs=1e-4)
+        assert result["score"] == pytest.approx(saved["score"], abs=1e-3)
     head, *rows = (run / "train.csv").read_text("utf-8").split()
-    assert head == "frames,eval_success_rate,eval_spl"
+    assert head == "frames,eval_score,eval_success_rate,eval_spl"
     assert [int(row.split(",")[0]) for row in rows] == [8, 40, 80, 80]
-    assert float(rows[-1].split(",")[2]) == result["SPL"]
+    assert float(rows[-1].split(",")[1]) == result["score"]
 
 
 def test_batched_environment_under_stable_baselines3() -> None:

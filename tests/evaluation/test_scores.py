@@ -18,6 +18,7 @@ from torchrl.modules import LSTMModule
 
 from magrl import load_policy, save_policy, score
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
+from magrl.envs.measures import bootstrap_interval
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation.scores import SEED, flown, scored
 from magrl.named_tasks import NAMED_TASKS
@@ -172,7 +173,7 @@ def test_the_episodes_are_those_of_the_seed_in_gymnasium(wanted: dict[str, float
             found[vehicle] = [info[name][vehicle] for name in ("success", "spl", "steps")]
         running &= ~(terminated | truncated)
     success, spl, steps = np.mean(list(found.values()), axis=0)
-    scores = {"SR": 100 * success, "SPL": 100 * spl, "return": earned.mean(), "steps": steps}
+    scores = {"SR": 100 * success, "SPL": 100 * spl, "score": 10 * earned.mean(), "steps": steps}
     assert {key: wanted[key] for key in scores} == pytest.approx(scores, rel=1e-5)
 
 
@@ -207,7 +208,7 @@ def test_a_state_has_the_vehicles_on_the_first_axis() -> None:
     with pytest.raises(ValueError, match="vehicles on the first axis, got 5"):
         score(lambda observations, state: (observations[:, :2], state or 5), "box", episodes=3)
     whole, model = (score(agent, "box", episodes=3) for agent in (ordered, SimpleNamespace(predict=predict)))
-    assert whole["return"] == pytest.approx(model["return"])
+    assert whole["score"] == pytest.approx(model["score"])
 
 
 def test_a_recurrent_policy_of_torchrl_keeps_its_memory() -> None:
@@ -224,17 +225,18 @@ def test_a_recurrent_policy_of_torchrl_keeps_its_memory() -> None:
             return head(seen[:, 0]).numpy(), tuple(part.movedim(1, 0) for part in state)
 
     scores = score(policy, "readings", episodes=4, max_steps=5)
-    assert scores["return"] == pytest.approx(score(act, "readings", episodes=4, max_steps=5)["return"], rel=1e-5)
+    assert scores["score"] == pytest.approx(score(act, "readings", episodes=4, max_steps=5)["score"], rel=1e-5)
 
 
 def test_successes_that_end_far_away_are_counted() -> None:
     """Of three successes, one ends 60 km from the destination; a failure ends farther away."""
     ends = [(160.0, True), (110.0, True), (100.0, True), (300.0, False)]
     rollout = torch.cat([episode([(50.0, 0.0), (50.0, 0.0)], point(far, 0.0), good, 2) for far, good in ends])
-    rollout["next", "reward"] = torch.ones(4, 2, 1)
+    rollout["next", "reward"] = torch.tensor([4.0, 3.0, 2.0, 1.0]).expand(2, 4).T.unsqueeze(-1)
     scores = scored(rollout)
     assert scores["beyond_50km"] == pytest.approx(100 / 3)
-    assert (scores["SR"], scores["return"], scores["steps"]) == (75.0, 2.0, 2.0)
+    assert (scores["SR"], scores["score"], scores["steps"]) == (75.0, 50.0, 2.0)
+    assert (scores["score_low"], scores["score_high"]) == bootstrap_interval(torch.tensor([80.0, 60.0, 40.0, 20.0]))
     assert math.isnan(scored(rollout[3:])["beyond_50km"])
 
 

@@ -76,13 +76,13 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert with_paths(whole) == []
     written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
     assert (written["num_trips"], written["trips_seed"], written["frames"]) == (6, TEST_SEED, 192)
-    assert written["spl"] == result["spl"]
+    assert (written["spl"], written["score"]) == (result["spl"], result["score"])
     assert config["recipe"] == module.RECIPE
     assert tuple(config.get("noise", NOISE)) == NOISE
     rows, weights = outcome(whole)
     assert result["updates"] == int(rows[-1]["updates"]) > 0
     losses = getattr(module, "LOSSES", ("loss_critic", "loss_actor"))
-    assert all(math.isfinite(float(rows[-1][key])) for key in (*losses, "eval_return"))
+    assert all(math.isfinite(float(rows[-1][key])) for key in (*losses, "eval_score"))
     policy = load_policy(run / "policy.safetensors")
     env = policy_env(GeomagneticNavEnv(num_envs=3, seed=0), policy)
     assert env.rollout(2, policy)["action"].isfinite().all()
@@ -103,7 +103,7 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
     few_steps(monkeypatch, 4)
     make_critic = Mock(wraps=recipe.make_critic)
     monkeypatch.setattr(recipe, "make_critic", make_critic)
-    recipe.train(small(recipe, tmp_path / "run", task="nogo", reward="progress", total_frames=64, eval_every=4))
+    recipe.train(small(recipe, tmp_path / "run", task="nogo", reward="spl", total_frames=64, eval_every=4))
     assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
     assert make_critic.call_args.kwargs["geometry"].observe_areas
     rows, _ = outcome(tmp_path / "run")
@@ -125,7 +125,7 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
 def test_training_in_eddies(tmp_path: Path, monkeypatch) -> None:
     """Its policy gets its last legs from the map of any environment of one region, and acts as in training."""
     few_steps(monkeypatch, 8, "eddies")
-    options = {"reward": "progress", "total_frames": 64, "eval_every": 4, "eval_trips": 2, "eval_trips_small": 2}
+    options = {"reward": "spl", "total_frames": 64, "eval_every": 4, "eval_trips": 2, "eval_trips_small": 2}
     recipe.train(small(recipe, tmp_path / "run", task="eddies", **options))
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
     make = partial(eddies_env, 8, max_steps=8, seed=1)
@@ -160,7 +160,7 @@ def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys, m
     """The first episodes end before the replay buffer holds a batch; progress is shown in episodes."""
     few_steps(monkeypatch, 10)
     options = {"total_episodes": 1, "total_frames": 88, "batch_size": 85, "num_envs": 4, "zeta": 1e-12}
-    result = recipe.train(small(recipe, tmp_path, task="nogo", reward="progress", **options))
+    result = recipe.train(small(recipe, tmp_path, task="nogo", reward="spl", **options))
     text = capsys.readouterr()
     assert "episode/s" in text.err
     assert f"Warning: no gradient step was made in {result['frames']} frames" in text.err

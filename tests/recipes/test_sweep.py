@@ -40,7 +40,7 @@ if seed == "6" and not Path("again").exists():  # another one, which fails late
 if seed != "7":
     agent = "eddies" if seed == "0" else "memory"
     shutil.copy(f"{PRETRAINED}/{{agent}}.safetensors", out / "policy.safetensors")
-(out / "train.csv").write_text(f"frames,return,eval_spl\\n100,1,{{seed}}0\\n150,2,\\n200,3,50\\n")
+(out / "train.csv").write_text(f"frames,return,eval_score\\n100,1,{{seed}}0\\n150,2,\\n200,3,50\\n")
 """
 
 
@@ -68,15 +68,15 @@ def test_each_seed_is_trained_once_and_scored_as_by_the_library(capsys) -> None:
     options = {"--task": "box", "--seed": "1", "--out": str(Path("mine/box-mine-seed1").resolve())}
     assert calls()[1] == [options, [], "1", "mine"]
     scores = read_csv("mine/scores.csv.gz")
-    assert list(scores) == ["task", "agent", "seed", "episode", "success", "SPL", "return", "steps"]
+    assert list(scores) == ["task", "agent", "seed", "episode", "score", "success", "SPL", "steps"]
     assert scores[["task", "agent"]].drop_duplicates().to_numpy().tolist() == [["box", "mine"]]
     assert scores["episode"].tolist() == [*range(8), *range(8)]
     for seed, agent in enumerate(("eddies", "memory")):
         mean, wanted = scores[scores["seed"] == seed].mean(numeric_only=True), score(agent, "box", episodes=8)
         shown = {
+            "score": mean["score"],
             "SR": 100 * mean["success"],
             "SPL": 100 * mean["SPL"],
-            "return": mean["return"],
             "steps": mean["steps"],
         }
         assert shown == pytest.approx({key: wanted[key] for key in shown}, rel=1e-4)
@@ -160,11 +160,11 @@ def test_recipes_and_commands_share_seeds_and_options() -> None:
 
 def test_the_table_has_the_middle_of_the_seeds() -> None:
     spl = torch.tensor([0.0, 0.97, 0.98, 0.99, 1.0]).double()
-    rows = {"agent": "A", "seed": range(5), "success": 1, "SPL": spl, "return": 2.0, "steps": 9}
+    rows = {"agent": "A", "seed": range(5), "score": 2.0, "success": 1, "SPL": spl, "steps": 9}
     *_, last, iqm = sweep.table(DataFrame(rows)).splitlines()
     low, high = stratified_bootstrap([100 * spl])
-    assert last == "| A | 4 | 100.0 | 100.0 | 2.0 | 9.0 |"
-    assert f"| A | IQM | 100.0 (100.0–100.0) | 98.0 ({low:.1f}–{high:.1f}) | 2.0" in iqm
+    assert last == "| A | 4 | 2.0 | 100.0 | 100.0 | 9.0 |"
+    assert f"| A | IQM | 2.0 (2.0–2.0) | 100.0 (100.0–100.0) | 98.0 ({low:.1f}–{high:.1f}) | 9.0" in iqm
     assert interquartile_mean(spl).item() == pytest.approx(0.98)
 
 
@@ -172,9 +172,9 @@ def test_curves_are_the_evaluations(tmp_path: Path) -> None:
     job = sweep.Job.of(tmp_path, "box", "A", 3, "x")
     assert sweep.curves([job]).empty
     job.folder.mkdir()
-    (job.folder / "train.csv").write_text("frames,return,eval_spl\n10,1,\n20,2,50\n30,3,60\n", encoding="utf-8")
+    (job.folder / "train.csv").write_text("frames,return,eval_score\n10,1,\n20,2,50\n30,3,60\n", encoding="utf-8")
     points = sweep.curves([job, sweep.Job.of(tmp_path, "box", "A", 4, "x")])
-    assert points[["agent", "seed", "frames", "eval_spl"]].to_numpy().tolist() == [["A", 3, 20, 50], ["A", 3, 30, 60]]
+    assert points[["agent", "seed", "frames", "eval_score"]].to_numpy().tolist() == [["A", 3, 20, 50], ["A", 3, 30, 60]]
     (line,) = sweep.figure(points).axes[0].lines
     assert line.get_xydata().tolist() == [[20, 50], [30, 60]]
 

@@ -14,7 +14,6 @@ from magrl.training.curves import (
     BestPolicy,
     RunLog,
     TrainingStatistics,
-    selection_score,
     training_figure,
 )
 from magrl.training.wandb_run import WandbRun
@@ -53,13 +52,6 @@ def test_statistics_count_ended_episodes_only_and_continue_from_their_state() ->
     assert str(resumed.row()) == str(statistics.row())
 
 
-def test_selection_score_cannot_prefer_early_failure() -> None:
-    """A failed episode counts as the step limit: leaving the map at once is worth no more than flying to the end."""
-    success = torch.tensor([True, True, False])
-    assert selection_score(60.0, success, torch.tensor([10, 20, 30]), 50) == pytest.approx(60 - (10 + 20 + 50) / 3)
-    assert selection_score(60.0, success, torch.tensor([10, 20, 1]), 50) == pytest.approx(60 - (10 + 20 + 50) / 3)
-
-
 def test_best_policy_is_the_best() -> None:
     best, layer = BestPolicy(), nn.Linear(1, 1)
     for score, weight in ((1.0, 10.0), (3.0, 30.0), (2.0, 20.0)):
@@ -84,12 +76,12 @@ def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
 
 
 def test_training_figure_shows_the_columns_of_a_training() -> None:
-    """Return, its terms, success and losses, each from its column; the labels tell lines of a panel apart."""
-    columns = ["return", *(f"return_{term}" for term in RETURN_TERMS), "success_rate", "eval_success_rate", "eval_spl"]
-    columns += ["loss_critic", "loss_actor"]
+    """Return, its terms, score and losses, each from its column; the labels tell lines of a panel apart."""
+    columns = ["return", *(f"return_{term}" for term in RETURN_TERMS), "success_rate", "eval_score"]
+    columns += ["eval_success_rate", "eval_spl", "loss_critic", "loss_actor"]
     rows = [{"frames": 0.0, "return": math.nan}]  # a row without values is left out
     rows += [{"frames": frames, **{key: 10.0 * i + frames for i, key in enumerate(columns)}} for frames in (1, 2)]
     panels = training_figure(rows).axes
     shown = [[line.get_ydata()[0] for line in axes.lines] for axes in panels]
-    assert shown == [[1], [11, 21, 31], [41, 51, 61], [71, 81]]
+    assert shown == [[1], [11, 21, 31], [41, 51, 61, 71], [81, 91]]
     assert [text.get_text() for text in panels[1].get_legend().get_texts()] == list(RETURN_TERMS)

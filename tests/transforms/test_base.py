@@ -30,7 +30,6 @@ from magrl.transforms import (
     HighestSPL,
     MinMaxNorm,
     NoGoAreas,
-    ProgressReward,
     RandomStepPrice,
     ReadingObservation,
     SPLReward,
@@ -60,7 +59,7 @@ def guided() -> Transform:
 def rewarded() -> Transform:
     """Rewards of agents without a map, with what a policy with a memory sees."""
     rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(), NoGoAreas()
-    others = ProgressReward(), KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity"])
+    others = KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity"])
     return Compose(*rewards, *others)
 
 

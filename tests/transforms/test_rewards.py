@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from support.environments import paper_field
@@ -13,9 +14,12 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, planet_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.evaluation.episodes import episode_scores
+from magrl.evaluation.scores import flown
 from magrl.field.elements import elements_gradient
 from magrl.field.model import elements_at
 from magrl.geodesy import geodesic, move
+from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import Secant
 from magrl.transforms import (
     AlignmentReward,
@@ -23,7 +27,6 @@ from magrl.transforms import (
     FieldGradient,
     GradientHeading,
     HighestSPL,
-    ProgressReward,
     RandomStepPrice,
     SPLReward,
     TrueDisplacement,
@@ -54,43 +57,61 @@ def test_displacement_leads_to_the_target(latitude: float) -> None:
 # The reward
 
 
-def test_highest_spl_by_hand() -> None:
-    """A trip of 100 km: 60 km flown for 40 km of progress; then the arrival after 40 km more, or the end elsewhere."""
-    start, target = torch.zeros(3, 2), torch.tensor([[0.0, 0.898315]]).expand(3, 2)
-    flags = torch.tensor([[False], [True], [False]]), torch.tensor([[False], [True], [True]])
+def test_earned_spl_by_hand() -> None:
+    """A trip of 100 km, after 20 km and a leg more: on the way, arrived, failed, carried by a current, and beyond."""
+    target = torch.tensor([[0.0, 0.898315]]).expand(5, 2)  # 100 km to the east
     after = TensorDict(
-        true_displacement=torch.tensor([[60.0, 0.0], [3.0, 4.0], [60.0, 0.0]]),
-        leg=torch.tensor([[60.0, 0.1], [100.0, 0.0], [60.0, 0.0]]),
-        start_position=start,
+        true_displacement=torch.tensor([[60.0, 0.0], [3.0, 4.0], [60.0, 0.0], [0.0, 50.0], [120.0, 160.0]]),
+        leg=torch.tensor([[40.0, 0.1], [180.0, 0.0], [40.0, 0.0], [20.0, 0.0], [30.0, 0.0]]),
+        start_position=torch.zeros(5, 2),
         target_position=target,
-        success=flags[0],
-        done=flags[1],
-        step_price=torch.full((3, 1), 0.5),
-        batch_size=[3],
+        success=torch.tensor([[False], [True], [False], [False], [False]]),
+        done=torch.tensor([[False], [True], [True], [False], [False]]),
+        step_price=torch.full((5, 1), 0.5),
+        batch_size=[5],
     )
-    before = {"true_displacement": torch.tensor([[0.0, 100.0]]).expand(3, 2), "highest_spl": torch.ones(3, 1)}
-    step = SPLReward()(HighestSPL()(TensorDict({**before, "next": after}, [3])))["next"]
-    torch.testing.assert_close(step["highest_spl"], torch.tensor([[100 / 120], [1.0], [0.0]]), rtol=0, atol=1e-4)
-    torch.testing.assert_close(step["reward"], 10 * (step["highest_spl"] - 1) - 0.05)
+    before = {
+        "highest_spl": torch.ones(5, 1),
+        "earned_spl": torch.full((5, 1), 0.1),
+        "path_km": torch.full((5, 1), 20.0),
+    }
+    step = HighestSPL()(TensorDict(before | {"next": after}, [5]))
+    highest, earned = [100 / 120, 0.5, 0.0, 1.0, 0.4], [100 / 120 * 0.2, 0.5, 100 / 120 * 0.2, 0.25, -0.2]
+    found = torch.cat([step["next", key] for key in ("highest_spl", "earned_spl", "path_km")], -1)
+    wanted = torch.tensor([highest, earned, [60.0, 200.0, 60.0, 40.0, 50.0]]).T
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
+    torch.testing.assert_close(SPLReward()(step)["next", "reward"], 10 * (wanted[:, 1:2] - 0.1), rtol=0, atol=1e-3)
+    old = SPLReward(["highest_spl", "step_price"])(step)["next", "reward"]
+    torch.testing.assert_close(old, 10 * (wanted[:, :1] - 1) - 0.05, rtol=0, atol=1e-3)
 
 
 def test_returns_depend_on_both_ends_alone() -> None:
-    """Progress: kilometers nearer over 50, 10 at the arrival, 0.1 for each step; else SPL less the price of steps."""
-    rollouts, efficiency = [], (RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward())
-    for rewards in ((TrueDisplacement(), ProgressReward()), efficiency):
-        env = TransformedEnv(nav(64, max_steps=10), Compose(*rewards))
-        rollouts.append(evaluation_rollout(env, Secant()))
-    measures = episode_measures(rollouts[0])
-    within = torch.arange(rollouts[0].shape[1]) < measures["steps"].unsqueeze(-1)
-    nearer_km, price = measures["shortest_km"] - measures["navigation_error_km"], rollouts[1]["step_price"][:, 0, 0]
-    expected = (
-        nearer_km / 50 + 10 * measures["success"] - 0.1 * measures["steps"],
-        10 * (measures["spl"] - 1) - 0.1 * price * measures["steps"],
-    )
-    for rollout, returns in zip(rollouts, expected, strict=True):
-        found = (rollout["next", "reward"].squeeze(-1) * within).sum(-1).double()
-        torch.testing.assert_close(found, returns, rtol=0, atol=5e-3)
+    """With the highest SPL and prices: SPL less those of the steps."""
+    rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(["highest_spl", "step_price"])
+    rollout = evaluation_rollout(TransformedEnv(nav(64, max_steps=10), Compose(*rewards)), Secant())
+    measures, price = episode_measures(rollout), rollout["step_price"][:, 0, 0]
+    expected = 100 * (measures["spl"] - 1) - price * measures["steps"]
+    torch.testing.assert_close(episode_scores(rollout), expected, rtol=0, atol=1e-4)
     assert 10 < measures["success"].sum() < 60
+
+
+@pytest.mark.parametrize("task", NAMED_TASKS)
+def test_the_score_is_spl_for_arrivals_and_below_a_half_for_failures(task: str) -> None:
+    """Of a rule, a network and random actions, also where currents carry vehicles: the path is through the water."""
+    successes, random = [], torch.Generator().manual_seed(0)
+
+    def at_random(seen: np.ndarray) -> np.ndarray:
+        return (2 * torch.rand(len(seen), 2, generator=random) - 1).numpy()
+
+    for agent in ("secant", "eddies" if task == "eddies" else "memory", at_random):
+        rollout = flown(agent, task, episodes=12)
+        measures, scores = episode_measures(rollout), episode_scores(rollout)
+        arrived = measures["success"]
+        torch.testing.assert_close(scores[arrived], 100 * measures["spl"][arrived], rtol=0, atol=1e-4)
+        assert (scores[~arrived] < 50).all()
+        successes.append(arrived)
+    assert torch.cat(successes).any()
+    assert not torch.cat(successes).all()
 
 
 def test_prices_are_log_uniform_and_stay_for_an_episode() -> None:
@@ -105,10 +126,9 @@ def test_prices_are_log_uniform_and_stay_for_an_episode() -> None:
 
 def test_what_is_missing_is_named() -> None:
     """Without the state before the leg there is no reward, and that of the environment must not pass for it."""
-    rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward()
-    td = TransformedEnv(nav(), Compose(*rewards)).rollout(1)
-    with pytest.raises(KeyError, match=r"SPLReward reads its state .*highest_spl"):
-        SPLReward()(td.exclude("highest_spl"))
+    td = TransformedEnv(nav(), Compose(TrueDisplacement(), HighestSPL(), SPLReward())).rollout(1)
+    with pytest.raises(KeyError, match=r"SPLReward reads its state .*earned_spl"):
+        SPLReward()(td.exclude("earned_spl"))
 
 
 def test_distance_cost_is_paid_for_each_kilometer() -> None:
