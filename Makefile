@@ -97,8 +97,8 @@ endef
 $(eval $(call training,td3_gradient_guided-fast,td3_gradient_guided.py))
 $(eval $(call training,td3_gradient_guided-fast-no-cost,td3_gradient_guided.py --distance-cost 0))
 $(eval $(call training,td3_gradient_guided-fast-noise,td3_gradient_guided.py --noise 0.05 0.05 5))
-$(eval $(call training,td3-fast,td3_gradient_guided.py --preset td3-fast))
-$(eval $(call training,td3-fast-cost,td3_gradient_guided.py --preset td3-fast --distance-cost 0.1))
+$(eval $(call training,td3-fast,td3_gradient_guided.py --preset fast --no-guided --distance-cost 0))
+$(eval $(call training,td3-fast-cost,td3_gradient_guided.py --preset fast --no-guided))
 $(eval $(call training,td3_gradient_guided-paper,td3_gradient_guided.py --preset paper))
 $(eval $(call training,td3-paper,td3_gradient_guided.py --preset td3-paper))
 

@@ -1,7 +1,7 @@
 """Gradient-Guided TD3: train an agent to navigate by the Earth's magnetic field.
 
     python recipes/td3_gradient_guided.py                     # preset fast, about a minute on two cores
-    python recipes/td3_gradient_guided.py --preset td3-fast   # the baseline without guidance
+    python recipes/td3_gradient_guided.py --preset td3-fast   # without guidance, by the task's reward
     python recipes/td3_gradient_guided.py --preset paper      # Table 1 and eight additions; hours on a CPU
     python recipes/td3_gradient_guided.py --task nogo         # around no-go areas; six minutes
     python recipes/td3_gradient_guided.py --task eddies       # in currents as fast as the vehicle; six minutes

@@ -69,7 +69,7 @@ def test_the_vehicle_is_that_of_the_settings() -> None:
     assert (leg[..., 1].abs() <= rules.max_turn_rad + 1e-6).all()
     drift = (true_leg - leg)[..., 0].abs() / leg[..., 0]
     assert 0.05 < drift.max() < 0.2 + 1e-5
-    path_km = true_leg[..., 0].cumsum(1)
+    path_km = leg[..., 0].cumsum(1)
     trip_km = geodesic(*td["start_position"].unbind(-1), *td["target_position"].unbind(-1))[0]
     best = trip_km / (path_km + td["true_displacement"].norm(dim=-1))
     torch.testing.assert_close(td["highest_spl"].squeeze(-1).double(), best.clamp(max=1), rtol=1e-4, atol=1e-4)
@@ -100,6 +100,13 @@ def test_only_the_spectrum_of_the_earth_is_trained_on(tmp_path, monkeypatch) -> 
     monkeypatch.setattr(recipe, "earth_scenario", without_earth)
     recipe.train(small(recipe, tmp_path / "run", total_frames=64, max_steps=3))
     assert seeds == [TEST_SEED]  # the test trips alone are on Earth
+
+
+def test_evaluations_are_by_the_reward_of_the_tasks() -> None:
+    config = recipe.PRESETS["fast"].replace(drift=0.2)
+    env = recipe.evaluation_env(planet_scenario(4, seed=3, **config.regions), 6, 5, config, **recipe.options_of(config))
+    step = env.rollout(2)
+    torch.testing.assert_close(step["next", "reward"], 10 * (step["next", "earned_spl"] - step["earned_spl"]))
 
 
 def test_presets() -> None:

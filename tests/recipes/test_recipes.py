@@ -97,6 +97,15 @@ def test_a_task_takes_its_preset_unless_another_is_given() -> None:
     assert found == [recipe.PRESETS["nogo"], recipe.PRESETS["fast"].replace(task="nogo")]
 
 
+def test_the_task_may_reward_a_guided_agent_too() -> None:
+    """In the paper's unit, and without the preset's cost of the distance."""
+    config = parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, None, ["--reward", "spl", "--num-envs", "4"])
+    step = recipe.make_env(Scenario(), config).rollout(3)
+    earned = 200 * (step["next", "earned_spl"] - step["earned_spl"]) + step["next", "reward_alignment"]
+    torch.testing.assert_close(step["next", "reward"], config.reward_scale * earned)
+    assert config.distance_cost > 0
+
+
 @pytest.mark.usefixtures("without_figures")
 def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatch) -> None:
     """Actor and critic see areas in training, and the policy flies where there are some."""
