@@ -99,10 +99,11 @@ class HighestSPL(StatefulTransform):
         after = self._named(values)
         start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
         trip_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
+        trip_km = trip_km.clamp_min(1e-6)  # a trip of no length has an SPL, too
         path_km, left_km = state[0] + after["leg"][..., :1], after["true_displacement"].norm(dim=-1, keepdim=True)
-        reach = trip_km / torch.maximum(torch.where(success, path_km, path_km + left_km), trip_km)
-        earned = torch.where(success, reach, 0.5 * (1 - left_km / trip_km) * reach)
-        highest = reach.masked_fill(after["done"] & ~success, 0.0)
+        whole_km = torch.maximum(torch.where(success, path_km, path_km + left_km), trip_km)
+        highest = (trip_km / whole_km).masked_fill(after["done"] & ~success, 0.0)
+        earned = torch.where(success, trip_km, (trip_km - left_km) / 2) / whole_km
         self._write_named(tensordict, highest_spl=highest, earned_spl=earned, path_km=path_km)
 
 
@@ -110,7 +111,7 @@ class SPLReward(StepReward):
     """Write 10 times the change of what is earned of the SPL (:class:`HighestSPL`). Privileged.
 
     The rewards of an episode add up to 10 times its SPL if it arrives, and to less than 5 if it fails. They are changes
-    of a potential, so that a detour and the return earn nothing. It replaces the reward of the environment.
+    of a potential, so that legs there and back earn nothing. It replaces the reward of the environment.
 
     Args:
         in_keys: what is earned ``(..., 1)``; and the price of a step ``(..., 1)`` [% of SPL], which may be left out.

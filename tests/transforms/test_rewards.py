@@ -85,6 +85,16 @@ def test_earned_spl_by_hand() -> None:
     torch.testing.assert_close(old, 10 * (wanted[:, :1] - 1) - 0.05, rtol=0, atol=1e-3)
 
 
+def test_a_trip_of_no_length_has_an_spl() -> None:
+    """As :func:`magrl.envs.measures.spl` has it: 1 for who stays, 0 for who comes back."""
+    numbers = {"start_position": 2, "target_position": 2, "true_displacement": 2}
+    after = TensorDict({key: torch.zeros(2, size) for key, size in numbers.items()}, [2])
+    after["leg"], after["success"] = torch.tensor([[0.0, 0.0], [50.0, 0.0]]), torch.ones(2, 1, dtype=torch.bool)
+    after["done"] = after["success"]
+    step = HighestSPL()(TensorDict(path_km=torch.zeros(2, 1), next=after, batch_size=[2]))["next"]
+    torch.testing.assert_close(step["earned_spl"], torch.tensor([[1.0], [0.0]]), rtol=0, atol=1e-6)
+
+
 def test_returns_depend_on_both_ends_alone() -> None:
     """With the highest SPL and prices: SPL less those of the steps."""
     rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(["highest_spl", "step_price"])
