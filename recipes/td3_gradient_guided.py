@@ -28,7 +28,7 @@ from magrl.navigators import FieldPolicy, PolicyConfig, make_critic
 from magrl.training import Run, SoftUpdate, TD3Loss, command, optimize, parse_config, saturation_penalty
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
-from magrl.transforms import DistanceCost, EpisodeSum
+from magrl.transforms import DistanceCost, EpisodeSum, Shield
 
 import torch
 from pydantic import Field, model_validator
@@ -61,6 +61,8 @@ class Config(rule_settings("start_heading"), RegionConfig):
     """Reward of the training: the paper's without its alignment, or the task's in the paper's unit."""
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
+    shield: bool = False
+    """Turn legs that would meet a no-go area in sight, in training and as a fixed last layer of the policy."""
 
     # Environment
     distance_cost: NonNegative = 0.0
@@ -141,7 +143,7 @@ def rewards(base: GeomagneticNavEnv, config: Config) -> list[Transform]:
 
 def make_env(scenario: Scenario, config: Config) -> TransformedEnv:
     """Return the environment of the training: the task with the reward, the sensors' noise and what is observed."""
-    return NAMED_TASKS[config.task].make(
+    env = NAMED_TASKS[config.task].make(
         config.num_envs,
         scenario=scenario,
         seed=config.seed,
@@ -150,6 +152,7 @@ def make_env(scenario: Scenario, config: Config) -> TransformedEnv:
         **config.options,
         **config.model_dump(include={"observe_heading", "observe_difference"}),
     )
+    return env.insert_transform(1, Shield(env.max_turn_rad)) if config.shield else env  # after the areas
 
 
 def make_collection(
@@ -186,7 +189,7 @@ def train(config: Config) -> dict[str, float]:
         validation, test = run.evaluation_envs(NAMED_TASKS[config.task].make, **config.options)
 
         # Networks
-        network = PolicyConfig(env.view, config.num_cells, config.layer_norm)
+        network = PolicyConfig(env.view, config.num_cells, config.layer_norm, config.shield)
         actor = network.make_actor(env.device)
         shape = {"layer_norm": config.layer_norm, "geometry": env.view.geometry}
         critic = make_critic(env.view.size, config.num_cells, **shape, device=env.device)

@@ -22,7 +22,7 @@ from torch import Tensor
 total_timesteps, num_trips = 400_000, 500
 
 # Training on random planets, with random noise of the sensors
-envs = gymnasium.make_vec("magrl/GeomagneticNavigationAnywhere-v1", num_envs=512, autoreset_mode="SameStep")
+envs = gymnasium.make_vec("magrl/GeomagneticNavigationAnywhere-v2", num_envs=512, autoreset_mode="SameStep")
 options = {"n_steps": 32, "batch_size": 2048, "n_epochs": 5, "learning_rate": 1e-3, "device": "cpu", "seed": 0}
 vehicles = VecMonitor(BatchedVecEnv(envs))
 model = PPO("MlpPolicy", vehicles, **options, policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0})

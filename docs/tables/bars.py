@@ -29,7 +29,7 @@ from magrl.named_tasks import NAMED_TASKS, storm_errors
 from magrl.navigators import Navigator, Secant
 from magrl.navigators.names import make_navigator
 from magrl.training import command
-from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, turned
+from magrl.transforms.areas import SEEN, SIGHT_KM, NoGoAreas, distance_km, inside_km, turned
 
 import torch
 import tyro
@@ -124,9 +124,9 @@ class Around(TensorDictModuleBase):
     """
 
     out_keys = ["action"]
-    BESIDE_KM, STEADY, ANGLES = 1.0, 0.3, 721
-    """Width of a strip beside each area [km], cost of a change of course by that of a deviation, angles tried; chosen
-    on other episodes."""
+    STEADY, ANGLES = 0.3, 721
+    """Cost of a change of course by that of a deviation, and angles tried. On 400 episodes of seed 31337, it has an SPL
+    of 96.05; with a strip of 1 km beside the areas 95.69, with a cost of 0 and 0.6 95.87 and 95.77."""
 
     def __init__(self, navigator: Navigator) -> None:
         super().__init__()
@@ -139,21 +139,11 @@ class Around(TensorDictModuleBase):
         offset = torch.linspace(-math.pi, math.pi, self.ANGLES)
         angle = turn.unsqueeze(-1) + offset
         reach = torch.where(length < self.limits[0] - 1e-3, length, math.inf)  # a whole leg has another behind it
-        inside_km = self._inside(tensordict["areas"], angle, reach[:, None, None])
+        inside = inside_km(tensordict["areas"], reach.unsqueeze(-1), angle)
         cost = offset.abs() + self.STEADY * angle.abs()
-        best = (inside_km + cost / 10).argmin(-1, keepdim=True)  # no turn is worth half a kilometer inside
+        best = (inside + cost / 10).argmin(-1, keepdim=True)  # no turn is worth half a kilometer inside
         chosen = angle.gather(-1, best).squeeze(-1)
         return tensordict.set("action", torch.stack(steer(torch.zeros_like(turn), chosen, length, *self.limits), -1))
-
-    def _inside(self, areas: Tensor, angle: Tensor, reach: Tensor) -> Tensor:
-        """Return how far paths at angles ``(N, A)`` enter areas and the strip beside them, ``(N, A)`` [km]."""
-        forward, right, size = (part.unsqueeze(-2) for part in areas.unflatten(-1, (SEEN, 3)).unbind(-1))
-        radius = RADIUS_KM[1] * size
-        center_km = radius + SIGHT_KM * (1 - torch.hypot(forward, right))
-        away = torch.atan2(right, forward) - angle.unsqueeze(-1)
-        along, across = center_km * torch.cos(away), center_km * torch.sin(away)
-        beside = torch.hypot(along - torch.minimum(along.clamp_min(0), reach), across)
-        return ((radius + self.BESIDE_KM - beside).clamp_min(0) * (size > 0)).amax(-1)
 
 
 def flown(task: str, navigator: str, vehicles: int | None = None, **options: Any) -> tuple[EnvBase, TensorDictBase]:

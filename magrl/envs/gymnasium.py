@@ -29,8 +29,7 @@ from magrl.envs.specs import PUBLIC_KEYS
 from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.transforms.areas import outlines
 
-ENV_ID = "magrl/GeomagneticNavigation-v0"
-ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v1"
+ENV_ID, ANYWHERE_ID = (NAMED_TASKS[name].id for name in ("box", "anywhere"))
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
 # A forked process lacks the threads of its parent, and would wait for them.
@@ -80,7 +79,7 @@ _SPEC: Any = property(lambda env: getattr(env, "limited_spec", None), _keep_spec
 
 
 class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
-    """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
+    """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v1", num_envs=N, **options)``.
 
     All move in one batched step. The autoreset modes are Gymnasium's. With ``NEXT_STEP``, the step after the end
     of an episode starts the next, whatever the action; with ``DISABLED``, ``reset(options={"reset_mask": ended})``.
@@ -227,7 +226,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
 
 
 class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One vehicle: ``gymnasium.make("magrl/GeomagneticNavigation-v0", **options)``.
+    """One vehicle: ``gymnasium.make("magrl/GeomagneticNavigation-v1", **options)``.
 
     ``reset(seed=s)`` starts the first episode of vehicle 0 of the TorchRL environment of seed ``s``; each ``reset()``
     after it starts the next. The ``info`` of an episode's last step holds its measures (``success``, ``is_success``,

@@ -49,7 +49,7 @@ def score(agent: Any, task: str, *, episodes: int = 1000, seed: int = SEED, **op
               ``act(observations, state)`` returns actions and the next state, which is None at the start: arrays with
               the vehicles on their first axis, or a tuple, list or dict of them. It gets no other key.
         task: name or id of a task in :data:`magrl.named_tasks.NAMED_TASKS`: ``"nogo"``, or
-            ``"magrl/GeomagneticNavigationNoGo-v0"``.
+            ``"magrl/GeomagneticNavigationNoGo-v1"``.
         episodes: vehicles, each with one episode.
         seed: seed of the episodes; the default is reserved for evaluations.
         options: of its function in :mod:`magrl.named_tasks`. The score is then not the task's.

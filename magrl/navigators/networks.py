@@ -73,8 +73,8 @@ class AreaGeometry(nn.Module):
     Example:
         >>> from magrl.named_tasks import no_go_env
         >>> geometry = AreaGeometry(no_go_env(seed=0).view)
-        >>> geometry(torch.zeros(5, 22)).shape, geometry(torch.zeros(5, 24)).shape
-        (torch.Size([5, 46]), torch.Size([5, 54]))
+        >>> geometry(torch.zeros(5, 25)).shape, geometry(torch.zeros(5, 27)).shape
+        (torch.Size([5, 55]), torch.Size([5, 65]))
     """
 
     UNIT_KM, CLEAR_KM = 100.0, 20.0
@@ -107,7 +107,7 @@ class AreaGeometry(nn.Module):
         return torch.cat((*parts, action, clear, torch.sigmoid(clear_km / 2).where(there, 1.0)), -1)
 
     def _clear_km(self, action: Tensor, center: Tensor, bearing: Tensor) -> Tensor:
-        """Return the least distance of a leg from centers ``(..., 3)`` [km]."""
+        """Return the least distance of a leg from centers ``(..., 4)`` [km]."""
         leg = self.view.max_leg_km / 2 * (action[..., :1] + 1)
         away = bearing - action[..., 1:] * self.view.max_turn_rad
         along, across = center * torch.cos(away), center * torch.sin(away)

@@ -30,6 +30,7 @@ from magrl.navigators.onnx import OnnxNetwork, description_of, exported, with_de
 from magrl.pilot.network import save_pilot
 from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.transforms import LegsView, ObservationView, ReadingView
+from magrl.transforms.areas import shielded
 
 View = ObservationView | LegsView | ReadingView
 _Std = Annotated[float, Field(ge=0)]
@@ -45,10 +46,12 @@ class PolicyConfig:
         view: what the policy observes, and its scaling: values scaled to a region, or plain readings.
         num_cells: width of each hidden layer; None for a network of another kind.
         layer_norm: whether hidden layers are normalized.
+        shield: whether the last layer is fixed: it turns legs that would meet a no-go area in sight
+            (:func:`~magrl.transforms.areas.shielded`). The agent is the network and its shield.
 
     Raises:
         TypeError: for a view of another type.
-        ValueError: for widths that are not positive whole numbers.
+        ValueError: for widths that are not positive whole numbers, or a shield without areas in the view.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -60,9 +63,13 @@ class PolicyConfig:
     view: View
     num_cells: tuple[int, ...] | None
     layer_norm: bool = True
+    shield: bool = False
 
     def __post_init__(self) -> None:
         check_type(tuple(VIEWS.values()), view=self.view)
+        check_type(bool, shield=self.shield)
+        if self.shield and "areas" not in self.view.in_keys:
+            raise ValueError("shield True needs a view with no-go areas: take observe_areas=True, or leave it out")
         if self.num_cells is not None:
             self.make_actor("meta")  # checks the sizes
 
@@ -145,7 +152,8 @@ class FieldPolicy(Navigator):
         observed = self.observe(seen.select(*self.view.in_keys))
         network = isinstance(self.actor, OnnxNetwork)
         action = self.actor(observed["observation"]) if network else self.actor(observed)["action"]
-        return self.act.denormalize("action", action)
+        action = self.act.denormalize("action", action)
+        return shielded(action, seen["areas"], self.view.max_turn_rad) if self.config.shield else action
 
     def check_actor(self) -> None:
         """Raise unless the weights of the actor are those of the configuration, from which a file makes it again.
@@ -260,7 +268,8 @@ def save_policy(path: Path | str, policy: nn.Module | Path | str, view: View | N
         raise ValueError(f"the file of {kind}, got {str(path)!r}")
     kind = next(name for name, kind in VIEWS.items() if isinstance(policy.view, kind))
     if network:
-        write_atomically(Path(path), with_description(policy.actor.content, {"kind": kind, "view": config["view"]}))
+        description = {"kind": kind, "view": config["view"], "shield": config["shield"]}
+        write_atomically(Path(path), with_description(policy.actor.content, description))
         return
     policy.check_actor()
     weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}

@@ -10,18 +10,22 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Bounded, Composite
+from torchrl.envs import Transform
 
 from magrl.checks import check_number
-from magrl.geodesy import move_place, polar
+from magrl.geodesy import move_place, polar, steer
 from magrl.random_numbers import stream_uniform
+from magrl.transforms.base import observed_spec, with_state
 from magrl.transforms.episode import Episode, EpisodeNumbers
 
 ALONG, ACROSS_KM = (0.2, 0.8), 80.0
 """Centers lie at this share of the displacement from the destination to the start, and up to so far beside it [km]."""
-NUMBER, SEEN = 4, 3
+NUMBER, SEEN = 4, 4
 """Discs of an episode by default, and those that are observed at once, nearest first."""
 RADIUS_KM, SIGHT_KM = (15.0, 40.0), 75.0
 """Lowest and highest radius, and the distance from the edge within which a disc is seen [km]; chosen."""
+CLEAR_KM, DEGREES = 0.3, 180
+"""By how much a shielded leg clears areas in sight [km], chosen among 0, 0.3 and 1; turns tried to each side."""
 
 
 class NoGoAreas(EpisodeNumbers):
@@ -36,7 +40,7 @@ class NoGoAreas(EpisodeNumbers):
         **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.episode.EpisodeNumbers`. The
             keys read are the true displacement ``(..., 2)`` in the frame of the vehicle [km], heading ``(..., 1)``
             [rad], and the flags ``success``, ``terminated``, ``truncated`` and ``done`` ``(..., 1)``, which are also
-            written. ``areas`` ``(..., 9)`` has for each disc in sight 1 at its edge to 0 at the limit of sight,
+            written. ``areas`` ``(..., 12)`` has for each disc in sight 1 at its edge to 0 at the limit of sight,
             times the direction forward and to the right, and its radius as a share of the highest. The key
             ``no_go_areas`` is the state: north and east of the center from the destination and radius of each disc
             [km], then the vehicle's position. It is privileged.
@@ -47,7 +51,7 @@ class NoGoAreas(EpisodeNumbers):
         >>> from magrl.transforms import TrueDisplacement
         >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueDisplacement(), NoGoAreas()))
         >>> env.rollout(3)["areas"].shape
-        torch.Size([2, 3, 9])
+        torch.Size([2, 3, 12])
     """
 
     channel = 11
@@ -113,6 +117,95 @@ class NoGoAreas(EpisodeNumbers):
         shape = (*like.shape[:-1], 3 * SEEN)
         observation_spec[self.out_keys[0]] = Bounded(-1.0, 1.0, shape, device=like.device, dtype=like.dtype)
         return observation_spec
+
+
+class Shield(Transform):
+    """Turn legs that would meet an area in sight, as :func:`shielded`, in an environment with :class:`NoGoAreas`.
+
+    It reads the ``areas`` before a step, and the action in km and rad: place it before the scaling of actions. The
+    action of the policy stays in the data. It has neither weights nor state.
+
+    Args:
+        max_turn_rad: largest turn [rad].
+
+    Raises:
+        ValueError: for a largest turn out of range.
+        KeyError: for a step from a TensorDict without areas.
+
+    Example:
+        >>> from magrl.named_tasks import no_go_env
+        >>> no_go_env(4, seed=0, transforms=[Shield()]).rollout(3)["observation"].shape
+        torch.Size([4, 3, 25])
+    """
+
+    def __init__(self, max_turn_rad: float = math.pi / 2) -> None:
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
+        self.max_turn_rad = max_turn_rad
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if (action := tensordict.get("action", None)) is None:
+            return tensordict
+        if (areas := tensordict.get("areas", None)) is None:
+            raise KeyError("Shield reads 'areas', which no_go_env has: step from what reset() or step_mdp() returned")
+        return tensordict.set("action", shielded(action, areas, self.max_turn_rad))
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Make the areas part of the state, for environments in other processes."""
+        areas = observed_spec(self).get("areas", None)
+        return input_spec if areas is None else with_state(input_spec, {"areas": areas})
+
+
+def shielded(action: Tensor, areas: Tensor, max_turn_rad: float = math.pi / 2) -> Tensor:
+    """Turn legs that would come within :data:`CLEAR_KM` of an area in sight by the least angle that clears it.
+
+    Where that angle is beyond the largest turn, the vehicle turns as far as it can and stays. Where none clears the
+    areas, it takes the one that enters least. Other legs stay as they are.
+
+    Args:
+        action: ``(..., K)``, distance [km] and turn [rad] first.
+        areas: ``(..., 12)`` what is seen before the leg (:class:`NoGoAreas`).
+        max_turn_rad: largest turn [rad].
+
+    Returns:
+        The action ``(..., K)``.
+
+    Example:
+        >>> ahead = torch.tensor([0.5, 0.0, 0.5] + 9 * [0.0])  # a radius of 20 km, from 37.5 km on
+        >>> shielded(torch.tensor([[50.0, 0.0], [30.0, 0.0]]), ahead.expand(2, -1))
+        tensor([[50.0000, -0.3665],
+                [30.0000,  0.0000]])
+    """
+    meets = inside_km(areas, action[..., :1], action[..., 1:2]).squeeze(-1) > 0
+    length, turn = action[meets][..., :2].split(1, -1)
+    offset = torch.arange(-DEGREES, DEGREES + 1, device=turn.device).to(turn.dtype) * (math.pi / 180)
+    cost = inside_km(areas[meets], length, turn + offset) + offset.abs() / 100  # a clear leg, and then the least turn
+    chosen = turn + offset[cost.argmin(-1, keepdim=True)]
+    turned_leg = steer(torch.zeros_like(chosen), chosen, length, math.inf, max_turn_rad)
+    action = action.clone()
+    action[meets] = torch.cat((*turned_leg, action[meets][..., 2:]), -1)
+    return action
+
+
+def inside_km(areas: Tensor, length: Tensor, angle: Tensor, beside_km: float = CLEAR_KM) -> Tensor:
+    """Return how far legs enter areas in sight and a strip beside them.
+
+    Args:
+        areas: ``(..., 12)`` what is seen before the leg (:class:`NoGoAreas`).
+        length: ``(..., 1)`` of the legs [km].
+        angle: ``(..., A)`` turn before each leg [rad].
+        beside_km: width of the strip [km].
+
+    Returns:
+        ``(..., A)`` [km], 0 for legs that meet none.
+    """
+    ahead, right, size = (part.unsqueeze(-2) for part in areas.unflatten(-1, (SEEN, 3)).unbind(-1))
+    radius = RADIUS_KM[1] * size
+    center_km = radius + SIGHT_KM * (1 - torch.hypot(ahead, right))
+    away = torch.atan2(right, ahead) - angle.unsqueeze(-1)
+    along, across = center_km * torch.cos(away), center_km * torch.sin(away)
+    nearest = torch.hypot(along - torch.minimum(along.clamp_min(0), length.unsqueeze(-1)), across)
+    return ((radius + beside_km - nearest).clamp_min(0) * (size > 0)).amax(-1)
 
 
 def outlines(numbers: Tensor, target: Tensor, points: int = 61) -> Tensor:

@@ -147,7 +147,7 @@ def test_tasks_on_planets_end_by_distance() -> None:
 def test_tasks_for_a_memory_show_readings_alone(task: str) -> None:
     """Those of Storm are farther from the truth than what the vehicle is told."""
     planets = planet_scenario(3, seed=0)
-    envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{task.title()}-v1", num_envs=40, scenario=planets)
+    envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{task.title()}-v2", num_envs=40, scenario=planets)
     assert envs.reset(seed=0)[0].shape == (40, 26)
     state = envs.unwrapped.torchrl_env.rollout(8, break_when_any_done=False)
     assert not {"displacement", "planned_leg", "belief_mean"} & set(state.keys())

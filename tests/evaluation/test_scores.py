@@ -86,9 +86,9 @@ def test_a_navigator_has_the_score_of_its_name() -> None:
 def test_a_task_is_given_by_its_name_or_its_id() -> None:
     name, scores = NAMED_TASKS["nogo"].id, score("secant", "nogo", episodes=2, max_steps=2)
     assert score("secant", name, episodes=2, max_steps=2) == pytest.approx(scores, nan_ok=True)
-    assert GeomagneticNavVectorEnv(2, task=name).single_observation_space.shape == (22,)
+    assert GeomagneticNavVectorEnv(2, task=name).single_observation_space.shape == (25,)
     with pytest.raises(ValueError, match=r"task must be one of 'box', .*, got 'magrl/GeomagneticNavigationNoGo-v9'"):
-        score("secant", name.replace("v0", "v9"))
+        score("secant", name.replace("v1", "v9"))
 
 
 def test_a_state_is_passed_to_every_function_that_has_one() -> None:

@@ -1,6 +1,7 @@
 """Trained policies as navigators of the plain environment, and their files."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,9 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl import Anywhere, GeomagneticNavEnv, ObservationView, Scenario
 from magrl.files import load_tensors, save_tensors
-from magrl.navigators import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.navigators.names import training_settings
+from magrl.named_tasks import no_go_env
+from magrl.navigators import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
+from magrl.navigators.names import make_navigator, training_settings
 from magrl.pilot.network import pretrained
 
 CELLS = (16, 16)
@@ -57,6 +59,35 @@ def test_save_and_load_give_the_same_actions(env, tmp_path: Path) -> None:
         loaded = load_policy(tmp_path / "policy.pt")
         assert loaded.config == policy.config
         assert all(torch.equal(loaded(state.clone())["action"], policy(state.clone())["action"]) for state in states)
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "policy.onnx"])
+def test_a_file_holds_the_shield_of_its_policy(name: str, tmp_path: Path) -> None:
+    env = no_go_env(64, seed=3, observation="dict", scale_actions=False)
+    config = PolicyConfig(no_go_env(seed=3).view, CELLS)
+    torch.manual_seed(0)
+    bare = FieldPolicy(config)
+    policy = FieldPolicy(replace(config, shield=True), bare.actor)
+    if name == "policy.onnx":
+        pytest.importorskip("onnxruntime")
+        exported = export_policy(bare.actor, config.view)
+        policy = FieldPolicy(replace(exported.config, shield=True), exported.actor)
+    save_policy(tmp_path / name, policy)
+    states = env.rollout(5, make_navigator("geodesic", env.base_env), break_when_any_done=False).flatten()
+    loaded, same, other = (each(states.clone())["action"] for each in (load_policy(tmp_path / name), policy, bare))
+    assert torch.equal(loaded, same)
+    assert not torch.allclose(loaded, other, atol=0.01)
+
+
+def test_a_policy_has_no_shield_by_default(view, policy, tmp_path: Path) -> None:
+    """Nor has one whose file says nothing of it; it needs areas in the view."""
+    save_policy(tmp_path / "policy.safetensors", policy)
+    content = load_tensors(tmp_path / "policy.safetensors")
+    del content["config"]["shield"]
+    save_tensors(content, tmp_path / "policy.safetensors")
+    assert not load_policy(tmp_path / "policy.safetensors").config.shield
+    with pytest.raises(ValueError, match="shield True needs a view with no-go areas: take observe_areas=True, or"):
+        PolicyConfig(view, CELLS, shield=True)
 
 
 def test_an_actor_of_another_shape_is_not_saved(env, tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ BUDGET = {
     "= 512, 1024, 8": "= 16, 16, 1",
     "= 400_000, 500": "= 32, 4",
     "num_envs=512, ": "num_envs=8, ",
-    '-v0", 256, ': '-v0", 8, ',
+    '-v1", 256, ': '-v1", 8, ',
     '"n_steps": 32, "batch_size": 2048': '"n_steps": 4, "batch_size": 32',
     "n_steps=32, batch_size=2048": "n_steps=4, batch_size=32",
     "learn(200_000)": "learn(32)",

@@ -33,7 +33,7 @@ assert not {"matplotlib", "pandas", "wandb", "tqdm", "tyro"} & (set(sys.modules)
 import gymnasium
 
 assert magrl.evaluate("anywhere", "paper-example")["success"].all()
-assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape == (13,)
+assert gymnasium.make("magrl/GeomagneticNavigation-v1").reset(seed=0)[0].shape == (13,)
 
 from magrl.evaluation import maps
 

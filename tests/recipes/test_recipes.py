@@ -28,6 +28,7 @@ from magrl.navigators import policy_env
 from magrl.random_numbers import TEST_SEED
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
+from magrl.transforms import Shield
 
 RECIPES = (recipe, ppo_anywhere, ppo_memory)
 NOISE = (0.05, 0.05, 5.0)
@@ -112,13 +113,19 @@ def test_training_around_no_go_areas(tmp_path: Path, outcome, capsys, monkeypatc
     few_steps(monkeypatch, 4)
     make_critic = Mock(wraps=recipe.make_critic)
     monkeypatch.setattr(recipe, "make_critic", make_critic)
-    recipe.train(small(recipe, tmp_path / "run", task="nogo", reward="spl", total_frames=64, eval_every=4))
+    options = {"task": "nogo", "reward": "spl", "shield": True, "total_frames": 64, "eval_every": 4}
+    config = small(recipe, tmp_path / "run", **options)
+    recipe.train(config)
+    assert any(isinstance(step, Shield) for step in recipe.make_env(Scenario(), config).transform)
     assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
     assert make_critic.call_args.kwargs["geometry"].observe_areas
     rows, _ = outcome(tmp_path / "run")
     assert all(math.isnan(float(rows[-1][f"return_{term}"])) for term in RETURN_TERMS[:2])  # not parts of the reward
 
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
+    assert policy.config.shield
+    with pytest.raises(ValueError, match="shield True needs a view with no-go areas"):
+        recipe.train(small(recipe, tmp_path / "box", shield=True))
     env = no_go_env(8, observation="dict", scale_actions=False, seed=1, max_steps=8)
     seen = next(state for state in evaluation_rollout(env, policy).unbind(1) if state["areas"].any())
     blind = seen.select(*policy.in_keys).set("areas", torch.zeros_like(seen["areas"]))

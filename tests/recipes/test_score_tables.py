@@ -16,6 +16,7 @@ from tensordict import TensorDict
 
 from magrl.navigators import Secant
 from magrl.training import parse_config
+from magrl.transforms.areas import CLEAR_KM, RADIUS_KM
 
 pytest.importorskip("stable_baselines3")
 scores = load("docs/tables/scores")
@@ -133,9 +134,9 @@ def test_the_rule_turns_as_little_as_clears_the_area_ahead() -> None:
     rule = bars.Around(Secant())
     rule.navigator.forward = lambda state: state.set("action", torch.tensor([[50.0, 0.0], [30.0, 0.0]]))
     angle, closeness = math.radians(-5.0), 1 - 60 / bars.SIGHT_KM
-    disc = torch.tensor([closeness * math.cos(angle), closeness * math.sin(angle), 20 / bars.RADIUS_KM[1]])
-    whole, short = rule(TensorDict(areas=torch.cat((disc, torch.zeros(6))).expand(2, 9), batch_size=2))["action"]
-    tangent = angle + math.asin((20 + rule.BESIDE_KM) / 80)
+    disc = torch.tensor([closeness * math.cos(angle), closeness * math.sin(angle), 20 / RADIUS_KM[1]])
+    whole, short = rule(TensorDict(areas=torch.cat((disc, torch.zeros(9))).expand(2, 12), batch_size=2))["action"]
+    tangent = angle + math.asin((20 + CLEAR_KM) / 80)
     torch.testing.assert_close(whole, torch.tensor([50.0, tangent]), atol=0.01, rtol=0)
     assert short.tolist() == [30.0, 0.0]  # the destination is before the disc
 

@@ -32,6 +32,7 @@ from magrl.transforms import (
     NoGoAreas,
     RandomStepPrice,
     ReadingObservation,
+    Shield,
     SPLReward,
     TargetDifference,
     TrackField,
@@ -58,7 +59,7 @@ def guided() -> Transform:
 
 def rewarded() -> Transform:
     """Rewards of agents without a map, with what a policy with a memory sees."""
-    rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(), NoGoAreas()
+    rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(), NoGoAreas(), Shield()
     others = KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity"])
     return Compose(*rewards, *others)
 

@@ -1,4 +1,4 @@
-"""All transforms: other keys in a foreign environment of any batch, stored data, and states of one instance each."""
+"""Transforms of observations: other keys in a foreign environment of any batch, stored data, states of one each."""
 
 import copy
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from torchrl.envs.utils import check_env_specs
 from magrl import Scenario, errors, transforms
 from magrl.pilot import Rules
 from magrl.transforms import AngleVector, DeclareArrival, EpisodeSum, MinMaxNorm, TrackField
-from magrl.transforms.base import StatefulTransform
+from magrl.transforms.base import ObservationTransform, StatefulTransform
 from magrl.transforms.track import READ_KEYS
 
 FLAGS = ("done", "terminated", "truncated")
@@ -92,7 +92,7 @@ def waves(position: Tensor) -> Tensor:
 
 STD, RULES = (0.1, 0.1, 10.0), Rules(arrival="declared")
 PUBLIC = [kind for kind in (vars(transforms) | vars(errors)).values() if isinstance(kind, type)]
-KINDS = [kind for kind in PUBLIC if issubclass(kind, Transform)]
+KINDS = [kind for kind in PUBLIC if issubclass(kind, ObservationTransform)]  # Shield writes none
 OPTIONS: dict[type[Transform], dict] = {
     transforms.DistanceCost: {"cost": 0.1},
     transforms.FieldGradient: {"field": waves},
