@@ -255,7 +255,7 @@ def eddies_env(num_envs: int = 1, *, eddies_km_h: float = EDDY_MOTION["eddies_km
 
     Example:
         >>> eddies_env(4, seed=0).rollout(3)["observation"].shape
-        torch.Size([4, 3, 45])
+        torch.Size([4, 3, 47])
     """
     from magrl.envs.navigation import navigation_env
     from magrl.errors import MotionError

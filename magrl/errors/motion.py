@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number
 from magrl.errors.base import LEG_ERROR, EpisodeErrors
-from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
+from magrl.geodesy import MEAN_RADIUS_KM, curvature_radii, displaced, local_frame, polar, wrap_angle
 from magrl.random_numbers import NORMAL_LIMIT, normal_of, stream_normal, stream_uniform
 from magrl.transforms.base import observed_spec
 from magrl.transforms.episode import Episode
@@ -40,13 +41,14 @@ class MotionError(EpisodeErrors):
         compass_deg: error of the compass in motion in an episode [deg].
         current_km_h: speed of a current whose direction is random in each episode [km/h].
         eddies_km_h: root-mean-square speed of a field of eddies, another one in each episode [km/h]; see
-            :func:`eddy_velocity`. Its value at the start of a leg holds for all of it.
+            :func:`eddy_velocity`. It is integrated along a leg by the fourth-order Runge-Kutta method.
         eddy_km: wavelength of the eddies [km].
         speed_km_h: speed of the vehicle through the water or the air [km/h]; needed with currents.
         fixed: whether ``log_scale`` and ``compass_deg`` are the errors themselves, in every episode.
         in_keys: last leg ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
             ``(..., 2)`` [deg].
-        out_keys: true leg ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
+        out_keys: true leg ``(..., 2)``, its direction ``(..., 1)`` [rad], and the current at the vehicle's place over
+            its speed ``(..., 2)``, northward and eastward. Privileged.
         **options: ``seed`` of :class:`~magrl.errors.base.EpisodeErrors`. The errors of the
             episode are scale, compass [deg], direction of the current and phases of the eddies [rad], and with
             eddies the uniform numbers of their directions (:func:`eddy_waves`).
@@ -67,7 +69,7 @@ class MotionError(EpisodeErrors):
 
     channel = 4
     default_in_keys = ("leg", "heading", "position")
-    default_out_keys = ("true_leg", "true_course")
+    default_out_keys = ("true_leg", "true_course", "true_current")
     true_keys = (*default_out_keys, LEG_ERROR)
     numbers_key, stream_key = "motion_error", "motion_stream"
     in_sizes = {"leg": (2,), "heading": (1,), "position": (2,)}
@@ -142,30 +144,49 @@ class MotionError(EpisodeErrors):
         added = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
         hours = (distance / self.speed_km_h).unsqueeze(-1)
         added = added + hours * self.current_km_h * _unit(direction)
+        return added + self._drift(added + distance.unsqueeze(-1) * _unit(bow), hours, position, errors)
+
+    def _drift(self, leg: Tensor, hours: Tensor, position: Tensor, errors: Tensor) -> Tensor | float:
+        """Return how far eddies carry a vehicle along a leg ``(..., 2)`` [km], by Runge and Kutta's four stages."""
+        if not self.eddies_km_h:
+            return 0.0
+        velocity, hours = self._eddies(position, errors), self.eddies_km_h * hours
+        first = hours * velocity(torch.zeros_like(leg))
+        second = hours * velocity((leg + first) / 2)
+        third = hours * velocity((leg + second) / 2)
+        return (first + 2 * (second + third) + hours * velocity(leg + third)) / 6
+
+    def _eddies(self, position: Tensor, errors: Tensor) -> Callable[[Tensor], Tensor]:
+        phases, directions = errors[..., 3:].tensor_split([EDDIES], -1)
+        return eddy_velocities(position.double(), eddy_waves(directions, self.eddy_km), phases)
+
+    def _current(self, position: Tensor, errors: Tensor) -> Tensor:
+        """Return the current at a place over the speed of the vehicle, ``(..., 2)`` northward and eastward."""
+        current = self.current_km_h * _unit(errors[..., 2])
         if self.eddies_km_h:
-            phases, directions = errors[..., 3:].tensor_split([EDDIES], -1)
-            velocity = eddy_velocity(position, eddy_waves(directions, self.eddy_km), phases)
-            added = added + hours * self.eddies_km_h * velocity
-        return added
+            current = current + self.eddies_km_h * self._eddies(position, errors)(torch.zeros_like(position))
+        return current / self.speed_km_h
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        """Write the true leg and its direction."""
-        leg, heading, _ = values
+        """Write the true leg, its direction, and the current."""
+        leg, heading, position = values
         if not episode.first:
             distance, bow = leg[..., 0].double(), heading[..., 0].double()
             distance, course = polar(displaced(distance, bow, tensordict[LEG_ERROR]))
             leg = torch.stack((distance, leg[..., 1].double()), -1).to(leg.dtype)
             heading = torch.where(distance > 0, course, heading[..., 0]).unsqueeze(-1).to(heading.dtype)
-        tensordict.set(self.out_keys[0], leg).set(self.out_keys[1], heading)
+        current = self._current(position, episode.numbers.double()).to(heading.dtype)
+        self._write_named(tensordict, true_leg=leg, true_course=heading, true_current=current)
         return episode.numbers
 
     # Specs
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the true leg, its direction, the errors and the state of the numbers."""
+        """Add the true leg, its direction, the current, the errors and the state of the numbers."""
         observation_spec = super().transform_observation_spec(observation_spec)
         leg, heading, _ = (observation_spec[key] for key in self.in_keys)
-        self._add(observation_spec, leg, self.out_keys[0], 2)
+        for key in (self.out_keys[0], self.out_keys[2]):
+            self._add(observation_spec, leg, key, 2)
         observation_spec[self.out_keys[1]] = heading.clone()
         return observation_spec
 
@@ -227,12 +248,35 @@ def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
         >>> eddy_velocity(torch.zeros(1, 2), waves, torch.zeros(1, 1))
         tensor([[-0.0000, 1.7321]])
     """
-    north, east, down = local_frame(*position.unbind(-1)).unbind(-2)
-    unit = waves / waves.norm(dim=-1, keepdim=True)
-    swing = torch.cos(phases - (waves * down.unsqueeze(-2)).sum(-1)) * math.sqrt(3 / waves.shape[-2])
-    gradient = (swing.unsqueeze(-1) * unit).sum(-2)
-    # gradient x up: northward is -(gradient·east), eastward is gradient·north
-    return torch.stack((-(gradient * east).sum(-1), (gradient * north).sum(-1)), -1)
+    return eddy_velocities(position, waves, phases)(torch.zeros_like(position))
+
+
+def eddy_velocities(position: Tensor, waves: Tensor, phases: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return :func:`eddy_velocity` as a function of displacements ``(..., 2)`` northward and eastward [km].
+
+    It is expanded around the position, in whose axes velocities are: within 0.3 % at 50 km.
+
+    Example:
+        >>> place, waves = torch.tensor([10.0, 160.0]), eddy_waves(torch.rand(16), 250.0)
+        >>> near, there = eddy_velocities(place, waves, torch.zeros(8)), torch.tensor([10.1, 160.0])
+        >>> apart = near(torch.tensor([11.06, 0.0])) - eddy_velocity(there, waves, torch.zeros(8))
+        >>> bool(apart.norm() < 0.01)
+        True
+    """
+    latitude, longitude = position.unbind(-1)
+    north, east, down = (waves @ local_frame(latitude, longitude).mT).unbind(-1)
+    size = math.sqrt(3 / waves.shape[-2]) / waves.norm(dim=-1)
+    radii = torch.stack(curvature_radii(latitude), -1)
+
+    def velocity(displacement: Tensor) -> Tensor:
+        arc = displacement / radii
+        along, across = arc.unsqueeze(-2).unbind(-1)
+        fall = arc.square().sum(-1, keepdim=True) / 2
+        swing = size * torch.cos(phases + north * along + east * across - down * (1 - fall))
+        # gradient x up: northward is -(gradient·east), eastward is gradient·north
+        return torch.stack((-(swing * (east + down * across)).sum(-1), (swing * (north + down * along)).sum(-1)), -1)
+
+    return velocity
 
 
 def _unit(angle: Tensor) -> Tensor:

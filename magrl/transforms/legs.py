@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -13,27 +14,32 @@ from torchrl.data import Composite, Unbounded
 from magrl.checks import check_number
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
 from magrl.field.model import FieldModel, elements_at
-from magrl.geodesy import geodesic, move_place, polar, to_ecef
+from magrl.geodesy import geodesic, move_place, polar
 from magrl.guidance import displacement_to
 from magrl.pilot.displacement import displacement_between
+from magrl.random_numbers import stream_normal
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms.areas import turned
-from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform
+from magrl.transforms.base import Keys, StatefulTransform
+from magrl.transforms.episode import Episode, EpisodeNumbers
 from magrl.transforms.sequences import per_nanotesla
 
-GRID, STEPS = 31, 4
-"""Places of the map in each direction from which a fix starts, and steps of Newton's method from the best of them."""
-ALIKE_NT, NEIGHBORS_KM = 0.1, 200.0
-"""Elements that differ by less are the same [nT]; places that are nearer to each other are not compared [km]."""
+GRID, MOST_STEPS = 32, 6
+"""Places of the map in each direction that its inverse is fitted to, and largest number of steps of Newton's method."""
+EXACT_KM, ALIKE_NT, NEAR_FIX_KM = 0.01, 0.1, 1.0
+"""Accuracy of a fix without errors [km]; a change of the elements [nT], and by how much it may move a fix [km]."""
 FAR_KM, NEAR_KM, LEG_KM = 400.0, 20.0, 100.0
 """Units of the distance to the destination and of its logarithm, and of the distance of a leg [km]."""
+BASE_KM, SHORT_KM = 2.0, 0.05
+"""Way between two readings that show a current, and the least leg whose set is shown in full [km]; chosen."""
 
 
-class Fix(ObservationTransform):
+class Fix(StatefulTransform):
     """Write the places at which a map of the field has the elements that were read, by Newton's method.
 
     It is the place of least squares: each element counts by its accuracy, where all are known and not 0, and otherwise
-    as a disturbance of the field does, in nT. Elements with errors give fixes with errors. Nothing that it writes is
+    as a disturbance of the field does, in nT. Elements with errors give fixes with errors. The first guess is a
+    quadratic of the elements, fitted to the map; the destination is solved at a reset alone. Nothing that it writes is
     privileged unless an input is.
 
     Args:
@@ -41,10 +47,11 @@ class Fix(ObservationTransform):
         region: region of the map (:class:`magrl.envs.Regions`), in which elements have one place.
         in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; and the standard deviations of a reading
             ``(..., 3)``, which may be left out.
-        out_keys: their places ``(..., 2)``, latitude and longitude [deg], float64.
+        out_keys: their places ``(..., 2)``, latitude and longitude [deg], float64. That of the target is the state.
 
     Raises:
-        ValueError: for a bank of fields, or a region in which two places have the same elements.
+        ValueError: for a bank of fields, or a region in which elements do not give their place, to 10 m without errors,
+            and to 1 km with one of 0.1 nT.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -59,9 +66,8 @@ class Fix(ObservationTransform):
     default_out_keys = ("fix", "target_fix")
     optional_in_keys = STD_KEYS[:1]
     in_sizes = {"field": (3,), "target_field": (3,), STD_KEYS[0]: (3,)}
-    places: Tensor
     middle: Tensor
-    scaled: Tensor
+    guess: Tensor
 
     def __init__(
         self, field: FieldModel, region: Any, in_keys: Keys | None = None, out_keys: Keys | None = None
@@ -70,46 +76,72 @@ class Fix(ObservationTransform):
         if getattr(field, "indexed", False) or len(region) != 1:
             raise ValueError(f"a map is of one region, got {len(region)}")
         self.field = field
-        self.register_buffer("places", region.grid(GRID).reshape(-1, 2))
-        elements = elements_at(field, self.places).double()
+        places = region.grid(GRID).reshape(-1, 2)
+        elements = elements_at(field, places).double()
         self.register_buffer("middle", elements[len(elements) // 2])
-        self.register_buffer("scaled", self._scaled(elements))
-        self._check_map(elements)
+        fitted = torch.linalg.lstsq(self._quadratic(elements), places).solution
+        self.register_buffer("guess", fitted.round(decimals=6))  # its last digits differ from run to run
+        self.steps = self._checked_steps(region.grid(2 * GRID - 1).reshape(-1, 2))
 
-    def _check_map(self, elements: Tensor) -> None:
-        """Raise if a place of the grid and another one have the same elements."""
-        here, points = self.places, to_ecef(*self.places.unbind(-1))
-        neighbors = torch.cdist(points, points) < NEIGHBORS_KM
-        second = torch.cdist(self.scaled, self.scaled).masked_fill(neighbors, torch.inf).argmin(-1)
-        found, residual = self._solved(elements, per_nanotesla(elements), here[second])
-        away = geodesic(*here.unbind(-1), *found.unbind(-1))[0]
-        same = (residual < ALIKE_NT) & (away > 1.0)
-        if same.any():
-            first, other = (place[same][0].tolist() for place in (here, found))
-            where = "({:.1f}, {:.1f}) and ({:.1f}, {:.1f})".format(*first, *other)
-            raise ValueError(f"the map is ambiguous: {where} have the same elements; give a smaller region")
+    def _checked_steps(self, places: Tensor) -> int:
+        """Return the least number of steps after which fixes are exact at all places; raise if there is none."""
+        elements = elements_at(self.field, places).double()
+        found, unit = self._guessed(elements), per_nanotesla(elements)
+        steps, away_km = 0, torch.full_like(unit[:, 0], math.inf)
+        while steps < MOST_STEPS and not (away_km < EXACT_KM).all():
+            found, jacobian = self._improved(found, elements, unit)
+            away_km, steps = geodesic(*places.unbind(-1), *found.unbind(-1))[0], steps + 1
+        weakest = torch.linalg.svdvals(jacobian.nan_to_num())[..., -1]  # [nT/km] where elements change least
+        wrong = ~(away_km < EXACT_KM) | (weakest * NEAR_FIX_KM < ALIKE_NT)
+        if wrong.any():
+            place, fix = (values[wrong][0].tolist() for values in (places, found))
+            where = "({:.1f}, {:.1f}) have their fix at ({:.1f}, {:.1f})".format(*place, *fix)
+            error = f"or an error of {ALIKE_NT:g} nT moves it by more than {NEAR_FIX_KM:g} km"
+            raise ValueError(f"the map is ambiguous: the elements at {where}, {error}; give a smaller region")
+        return steps
 
-    def _scaled(self, elements: Tensor) -> Tensor:
-        """Return elements less those in the middle of the map, in about nT."""
-        return element_difference(elements, self.middle) / per_nanotesla(self.middle)
+    def _quadratic(self, elements: Tensor) -> Tensor:
+        """Return the terms of a quadratic in elements ``(..., 3)``, ``(..., 10)``."""
+        scaled = element_difference(elements, self.middle) / per_nanotesla(self.middle) / 1000
+        x = torch.cat((torch.ones_like(scaled[..., :1]), scaled), -1)
+        return (x.unsqueeze(-1) * x.unsqueeze(-2))[..., *torch.triu_indices(4, 4)]
 
-    def _solved(self, elements: Tensor, unit: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the place at which the map has elements, near a first one, and how far they differ there."""
-        for _ in range(STEPS):
-            value, gradient = self.field.value_and_gradient(*place.unbind(-1))
-            error = element_difference(elements, measured_elements(value)) / unit
-            jacobian = elements_gradient(value, gradient) / unit.unsqueeze(-1)
-            distance, bearing = polar(displacement_to(error, jacobian))
-            place = move_place(place, bearing, distance.clamp_max(FAR_KM))
-        return place, error.norm(dim=-1)
+    def _guessed(self, elements: Tensor) -> Tensor:
+        """Return about the places ``(..., 2)`` of elements ``(..., 3)``."""
+        return (self._quadratic(elements).unsqueeze(-1) * self.guess).sum(-2)
 
-    def _compute(self, values: list[Tensor]) -> list[Tensor]:
-        elements = torch.stack(values[:2]).double()
-        unit, std = per_nanotesla(elements), values[-1].double()
+    def _improved(self, place: Tensor, elements: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Return places after a step of Newton's method, and slopes of elements before it ``(..., 3, 2)`` [1/km]."""
+        value, gradient = self.field.value_and_gradient(*place.unbind(-1))
+        jacobian = elements_gradient(value, gradient) / unit.unsqueeze(-1)
+        moved = displacement_to(element_difference(elements, measured_elements(value)) / unit, jacobian)
+        distance, bearing = polar(moved)
+        return move_place(place, bearing, distance.clamp_max(FAR_KM)), jacobian
+
+    def _fix(self, elements: Tensor, values: list[Tensor]) -> Tensor:
+        """Return the fixes ``(..., 2)`` of elements, weighed as the values at ``in_keys`` say."""
+        elements = elements.double()
+        unit = per_nanotesla(elements)
         if len(values) > 2:
+            std = values[-1].double()
             unit = torch.where((std > 0).all(-1, keepdim=True), std, unit)
-        near = self.places[torch.cdist(self._scaled(elements), self.scaled).argmin(-1)]
-        return list(self._solved(elements, unit, near)[0].unbind(0))
+        place = self._guessed(elements)
+        for _ in range(self.steps):
+            place, _ = self._improved(place, elements, unit)
+        return place
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
+        shape = values[0].shape[:-1]
+        # An accelerator would wait for the number of rows
+        begun = ... if mask is None or mask.device.type != "cpu" else mask.reshape(shape)
+        rows = [value[begun] for value in values]
+        for key, elements in zip(self.out_keys, rows, strict=False):
+            place = elements.new_zeros(*shape, 2, dtype=torch.float64)
+            place[begun] = self._fix(elements, rows)
+            tensordict.set(key, place)
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        tensordict.set(self.out_keys[0], self._fix(values[0], values)).set(self.out_keys[1], state[0])
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the places."""
@@ -117,6 +149,58 @@ class Fix(ObservationTransform):
         for key in self.out_keys:
             self._add(observation_spec, self._leaf(observation_spec, self.in_keys[0]), key, 2, dtype=torch.float64)
         return observation_spec
+
+
+class CurrentReading(EpisodeNumbers):
+    """Write the current at the vehicle's place, as two readings show it: there, and 2 km of its way before.
+
+    A vehicle that reads all along its way sees by a map of the field how far it was carried between two readings. Their
+    errors are those of the reading: what is constant cancels, and the white noise that the vehicle states moves a fix.
+    Nothing that it writes is privileged: the true current and position say where the second reading was made.
+
+    Args:
+        field: map of the field, such as ``env.field``; no bank.
+        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.episode.EpisodeNumbers`. The
+            keys read are the reading ``(..., 3)``: D [deg], I [deg], B_H [nT]; heading ``(..., 1)`` [rad]; fix and true
+            position ``(..., 2)`` [deg]; and, where they are given, the true current over the speed ``(..., 2)``, the
+            true elements at the place, and the noise of a reading ``(..., 3)``. Written is the current over the speed,
+            ``(..., 2)`` forward and to the right.
+
+    Example:
+        >>> from magrl.named_tasks import eddies_env
+        >>> state = eddies_env(2, seed=0).reset()  # heading north
+        >>> torch.allclose(state["current"].norm(dim=-1), state["true_current"].norm(dim=-1), atol=0.01)
+        True
+    """
+
+    channel = 13
+    stream_key = "current_stream"
+    size, step_draws = 2, 3
+    default_in_keys = ("field", "heading", "fix", "position")
+    default_out_keys = ("current",)
+    optional_in_keys = ("true_current", "true_field", STD_KEYS[0])
+
+    def __init__(self, field: FieldModel, **options: Any) -> None:
+        super().__init__(**options)
+        self.field, self.numbers_key = field, self.out_keys[0]
+
+    def _constants(self, stream: Tensor) -> Tensor:
+        return stream.new_zeros(*stream.shape, self.size, dtype=torch.float64)
+
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:  # noqa: ARG002
+        seen = self._named(values)
+        course = seen["heading"].double().squeeze(-1)
+        ahead = torch.stack((torch.cos(course), torch.sin(course)), -1)
+        distance, bearing = polar(-BASE_KM * (ahead + seen.get("true_current", torch.zeros_like(ahead))))
+        before = elements_at(self.field, move_place(seen["position"], bearing, distance)).double()
+        difference = element_difference(seen.get("true_field", seen["field"]).double(), before)
+        if STD_KEYS[0] in seen:  # of the difference of two readings
+            difference = difference + math.sqrt(2) * seen[STD_KEYS[0]] * stream_normal(episode.stream, self.step_draws)
+        value, gradient = self.field.value_and_gradient(*seen["fix"].unbind(-1))
+        unit = per_nanotesla(measured_elements(value))
+        jacobian = elements_gradient(value, gradient) / unit.unsqueeze(-1)
+        current = displacement_to(difference / unit, jacobian) / BASE_KM - ahead
+        return turned(current, -course.unsqueeze(-1)).to(seen["heading"].dtype)
 
 
 class RecentLegs(StatefulTransform):
@@ -169,7 +253,8 @@ class RecentLegs(StatefulTransform):
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         fix = values[0]
-        self._write(tensordict, values, fix.new_zeros(*fix.shape[:-1], self.count, 5))
+        none = fix.new_zeros(*fix.shape[:-1], self.count, 5)
+        self._write(tensordict, values, displacement_between(*values[:2]), none)
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         fix, target, command, heading, _ = values
@@ -177,13 +262,13 @@ class RecentLegs(StatefulTransform):
         moved, left = displacement_between(before, fix), displacement_between(fix, target)
         distance, course = command[..., :1].double(), heading.double()
         through = distance * torch.cat((torch.cos(course), torch.sin(course)), -1)
-        drift = (moved - through) / distance.clamp_min(1.0)
+        drift = (moved - through) / distance.clamp_min(SHORT_KM)
         leg = torch.cat((left + moved / 2, drift, torch.ones_like(distance)), -1)
-        self._write(tensordict, values, torch.cat((leg.unsqueeze(-2), legs[..., :-1, :]), -2))
+        self._write(tensordict, values, left, torch.cat((leg.unsqueeze(-2), legs[..., :-1, :]), -2))
 
-    def _write(self, tensordict: TensorDictBase, values: list[Tensor], legs: Tensor) -> None:
-        fix, target, _, heading, step = values
-        displacement, back = displacement_between(fix, target), -heading.double()
+    def _write(self, tensordict: TensorDictBase, values: list[Tensor], displacement: Tensor, legs: Tensor) -> None:
+        *_, heading, step = values
+        back = -heading.double()
         distance, (ahead, right) = displacement.norm(dim=-1, keepdim=True), turned(displacement, back).split(1, -1)
         places, drifts, known = legs.split((2, 2, 1), -1)
         places, back = places - displacement.unsqueeze(-2), back.unsqueeze(-2)

@@ -18,7 +18,7 @@ from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES
 from magrl.transforms.areas import SEEN
 from magrl.transforms.base import Keys, ObservationTransform
-from magrl.transforms.legs import Fix, RecentLegs
+from magrl.transforms.legs import CurrentReading, Fix, RecentLegs
 from magrl.transforms.scaling import MinMaxNorm
 
 READING_SIZES = {"field": 3, "target_field": 3, "leg": 2, "heading": 1, "elapsed_steps": 1}
@@ -252,7 +252,8 @@ class ObservationView(_View):
 
 @dataclass(frozen=True, kw_only=True)
 class LegsView(_View):
-    """Describe the observation of the last legs (:class:`~magrl.transforms.RecentLegs`), which needs a map.
+    """Describe the observation of the last legs (:class:`~magrl.transforms.RecentLegs`) and of the current at the
+    vehicle's place (:class:`~magrl.transforms.CurrentReading`), which needs a map.
 
     Args:
         count: number of legs.
@@ -265,7 +266,7 @@ class LegsView(_View):
 
     Example:
         >>> LegsView(max_steps=60, max_leg_km=25.0, max_turn_rad=1.5).size
-        45
+        47
     """
 
     count: int = 8
@@ -277,26 +278,31 @@ class LegsView(_View):
 
     @property
     def in_keys(self) -> tuple[str, ...]:
-        """Key of the environment that is observed."""
-        return RecentLegs.default_out_keys[:1]
+        """Keys of the environment that are observed."""
+        return RecentLegs.default_out_keys[0], CurrentReading.default_out_keys[0]
 
     @property
     def size(self) -> int:
         """Number of entries of ``observation``."""
-        return RecentLegs(self.count).size
+        return RecentLegs(self.count).size + CurrentReading.size
 
     def needed(self, env: EnvBase) -> list[Transform]:
         """Return the transforms that write what is observed, with the map of an environment."""
         base: Any = getattr(env, "base_env", env)
-        known = [key for key in Fix.optional_in_keys if key in env.observation_spec.keys()]  # noqa: SIM118
+        known = {*env.observation_spec.keys()}
+        fix, current = (
+            [*kind.default_in_keys, *(key for key in kind.optional_in_keys if key in known)]
+            for kind in (Fix, CurrentReading)
+        )
         return [
-            Fix(base.field, base.scenario.edge, [*Fix.default_in_keys, *known]),
+            Fix(base.field, base.scenario.edge, fix),
+            CurrentReading(base.field, in_keys=current),
             RecentLegs(self.count, self.max_steps),
         ]
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transform from the key to ``observation`` ``(..., size)``."""
-        return [CatTensors(list(self.in_keys), "observation", del_keys=False)]
+        return [CatTensors(list(self.in_keys), "observation", del_keys=False, sort=False)]
 
 
 @dataclass(frozen=True, kw_only=True)

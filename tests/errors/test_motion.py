@@ -88,10 +88,26 @@ def test_each_episode_has_eddies_of_its_own() -> None:
     errors = torch.cat((first["motion_error"], second["motion_error"]))
     waves = eddy_waves(errors[:, 3 + EDDIES :], 200.0)
     assert len(waves.flatten(0, 1).unique(dim=0)) == 6 * EDDIES
-    after = env.step(second.clone().set("action", torch.tensor([[50.0, 0.0]]).expand(3, -1)))["next"]
     velocity = 2.0 * eddy_velocity(second["position"], waves[3:].double(), errors[3:, 3 : 3 + EDDIES].double())
-    torch.testing.assert_close(after["leg_error"], 2.5 * velocity, atol=1e-3, rtol=0)
+    torch.testing.assert_close(20 * second["true_current"].double(), velocity, atol=1e-4, rtol=0)
     assert MotionError(log_scale=0.1).size == 3 + EDDIES
+
+
+def test_a_leg_through_eddies_is_that_of_a_fine_integration() -> None:
+    """Of 400 parts by Euler's method: within 50 m in 95 % of legs of 25 km, of which eddies move it by 18 km."""
+    count, parts = 1000, 400
+    errors = MotionError(eddies_km_h=0.9, eddy_km=250.0, speed_km_h=1.0)
+    env = TransformedEnv(nav(count, max_leg_km=25.0, drift_km=errors.farthest_km(25.0) - 25.0), errors)
+    state = env.reset()
+    phases, directions = state["motion_error"].double()[:, 3:].tensor_split([EDDIES], -1)
+    waves, place = eddy_waves(directions, 250.0), state["position"]
+    for _ in range(parts):
+        leg = 25 / parts * (0.9 * eddy_velocity(place, waves, phases) + torch.tensor((1.0, 0.0)))
+        place = torch.stack(move(*place.unbind(-1), torch.atan2(leg[:, 1], leg[:, 0]), leg.norm(dim=-1)), -1)
+    after = env.step(state.set("action", torch.tensor([[25.0, 0.0]]).expand(count, -1)))["next"]
+    off_km, _ = geodesic(*place.unbind(-1), *after["position"].unbind(-1))
+    assert off_km.quantile(0.95) < 0.06
+    assert off_km.max() < 0.3
 
 
 def test_the_environment_must_allow_the_farthest_leg() -> None:

@@ -94,6 +94,7 @@ STD, RULES = (0.1, 0.1, 10.0), Rules(arrival="declared")
 PUBLIC = [kind for kind in (vars(transforms) | vars(errors)).values() if isinstance(kind, type)]
 KINDS = [kind for kind in PUBLIC if issubclass(kind, ObservationTransform)]  # Shield writes none
 OPTIONS: dict[type[Transform], dict] = {
+    transforms.CurrentReading: {"field": paper_field()},
     transforms.DistanceCost: {"cost": 0.1},
     transforms.FieldGradient: {"field": waves},
     transforms.Fix: {"field": paper_field(), "region": Scenario().edge},
