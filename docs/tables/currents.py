@@ -1,4 +1,4 @@
-"""References in currents: rules that know where the vehicle is, and what it was set by, or the whole map of currents.
+"""References in currents: rules that know the places and currents of the way, or the whole map of currents.
 
 Places are in the plane of the destination, northward and eastward of it [km]; currents and speeds are over the speed of
 the vehicle.
@@ -13,6 +13,7 @@ from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
 from magrl.geodesy import geodesic, move_place, polar, steer
 from magrl.named_tasks import EDDY_MOTION
 from magrl.navigators import Navigator
+from magrl.transforms.areas import turned
 
 import torch
 from tensordict import TensorDictBase
@@ -78,12 +79,12 @@ class Grid:
 
 
 class CurrentRule(Navigator):
-    """Base class: remember the place of each leg and its current, and steer by the place in the plane.
+    """Base class: remember places and their currents, and steer by the place in the plane.
 
-    Reads fixes, as an environment with observation ``"legs"`` has them.
+    Reads fixes and currents, as an environment with observation ``"legs"`` has them.
     """
 
-    in_keys = ["fix", "target_fix", "leg", "heading", "elapsed_steps"]
+    in_keys = ["fix", "target_fix", "current", "heading", "elapsed_steps"]
     optional_keys = ()
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
@@ -92,12 +93,9 @@ class CurrentRule(Navigator):
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         place, step = place_of(seen["fix"], seen["target_fix"]), seen["elapsed_steps"].squeeze(-1)
-        distance, heading = seen["leg"][..., 0].double(), seen["heading"].squeeze(-1).double()
-        rows = torch.arange(len(place))
-        moved = place - memory["places"][rows, (step - 1).clamp_min(0)]
-        current = moved / distance.clamp_min(1.0).unsqueeze(-1) - unit(heading)
+        heading, rows = seen["heading"].squeeze(-1).double(), torch.arange(len(place))
         places, currents = memory["places"].clone(), memory["currents"].clone()
-        places[rows, step], currents[rows, (step - 1).clamp_min(0)] = place, current
+        places[rows, step], currents[rows, step] = place, turned(seen["current"].double(), heading.unsqueeze(-1))
         memory.update({"places": places, "currents": currents})
         course, length = self.chosen(place, places, currents, step)
         return steer(heading, course, length, self.max_leg_km, self.max_turn_rad)
@@ -108,19 +106,19 @@ class CurrentRule(Navigator):
 
 
 class Offset(CurrentRule):
-    """Steer for the destination, so that a share of the last current is offset."""
+    """Steer for the destination, so that a share of the current is offset."""
 
     SHARE = 0.5
 
     def chosen(self, place: Tensor, places: Tensor, currents: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         distance, bearing = polar(-place)
-        last = currents[torch.arange(len(place)), (step - 1).clamp_min(0)] * (step > 0).unsqueeze(-1)
-        beside = self.SHARE * (last * unit(bearing + math.pi / 2)).sum(-1)
+        here = currents[torch.arange(len(place)), step]
+        beside = self.SHARE * (here * unit(bearing + math.pi / 2)).sum(-1)
         return bearing - torch.asin(beside.clamp(-1, 1)), distance
 
 
 class Estimated(CurrentRule):
-    """Plan each leg on the mean of a Gaussian process of the currents, with their true spectrum, given all legs."""
+    """Plan each leg on the mean of a Gaussian process of the currents, with their true spectrum, given those of all places."""
 
     WAVES, ERROR = 192, 0.2
     """Waves of the process, and the standard deviation of a current that is read, which keeps the mean smooth: .05, .1,
@@ -150,9 +148,9 @@ class Estimated(CurrentRule):
         """Return the course of a vehicle."""
         if place.norm() < RADIUS_KM:  # its episode is over
             return torch.tensor(0.0)
-        seen = self.features(places[:step]).flatten(0, 1).double()
+        seen = self.features(places[: step + 1]).flatten(0, 1).double()
         precision = torch.eye(2 * self.WAVES, dtype=torch.float64) * 2 / self.rms**2 + seen.T @ seen / self.ERROR**2
-        mean = torch.linalg.solve(precision, seen.T @ currents[:step].flatten().double() / self.ERROR**2).float()
+        mean = torch.linalg.solve(precision, seen.T @ currents[: step + 1].flatten().double() / self.ERROR**2).float()
         return self._best(place, self.grid.plan(self.nodes @ mean), (self.features(place[None]) @ mean)[0])
 
     def _best(self, place: Tensor, cost: Tensor, current: Tensor) -> Tensor:
