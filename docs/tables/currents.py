@@ -118,7 +118,7 @@ class Offset(CurrentRule):
 
 
 class Estimated(CurrentRule):
-    """Plan each leg on the mean of a Gaussian process of the currents, with their true spectrum, given those of all places."""
+    """Plan each leg on the mean of a Gaussian process of the currents, with their true spectrum, given those so far."""
 
     WAVES, ERROR = 192, 0.2
     """Waves of the process, and the standard deviation of a current that is read, which keeps the mean smooth: .05, .1,
