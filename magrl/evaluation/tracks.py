@@ -144,7 +144,7 @@ TRACKS = {
     "box-v2": Track(box=True, levels=(PERFECT.noise, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))),
     "earth-v2": Track(trips=2000),
     "alone-v2": Track(within_km=25, max_steps=80),
-    "vehicles-v3": Track(trips=300, within_km=25, max_steps=120, sheet=Sheet(confidence=0.8), conditions=VEHICLES),
+    "vehicles-v4": Track(trips=300, within_km=25, max_steps=120, sheet=Sheet(confidence=0.8), conditions=VEHICLES),
     "north-v1": Track(
         within_km=25,
         max_steps=80,

@@ -26,18 +26,18 @@ TRACK_DIGESTS = {
     "box-v2": ("e532e868b7a49993", "b5d8da9cb6d53bea"),
     "earth-v2": ("49f64964da2779f5", "eb6505220e03610b"),
     "alone-v2": ("9d5691e12866b3c3", "eb6505220e03610b"),
-    "vehicles-v3": ("c293a315e0fae9c6", "f8f5f7e3e6f49ba6"),
+    "vehicles-v4": ("c293a315e0fae9c6", "cf36aa8dd95f3638"),
     "north-v1": ("e35c4d00c50322a3", "bcb45c2e6536f22e"),
 }
 """Of the declaration and trips, and of readings."""
 SETS = {"test-1000": "a86aacd1afedb688", "paper-100": "82cb3cd8bee75af2", "paper-example": "a7aac085136a6d62"}
 TASK_DIGESTS = {
-    "magrl/GeomagneticNavigation-v1": ("db358c00e517c132", -7.245),
-    "magrl/GeomagneticNavigationAnywhere-v2": ("cfb5b2950f361556", 57.982),
-    "magrl/GeomagneticNavigationReadings-v2": ("cfb5b2950f361556", 166.895),
-    "magrl/GeomagneticNavigationStorm-v2": ("b5326d98869b964b", 149.885),
-    "magrl/GeomagneticNavigationNoGo-v1": ("6e38ee89a111935e", -8.015),
-    "magrl/GeomagneticNavigationEddies-v1": ("5b8d041a7c400ea3", 176.683),
+    "magrl/GeomagneticNavigation-v1": ("db358c00e517c132", -5.373),
+    "magrl/GeomagneticNavigationAnywhere-v2": ("cfb5b2950f361556", 59.611),
+    "magrl/GeomagneticNavigationReadings-v2": ("cfb5b2950f361556", 169.094),
+    "magrl/GeomagneticNavigationStorm-v2": ("b5326d98869b964b", 152.084),
+    "magrl/GeomagneticNavigationNoGo-v1": ("6e38ee89a111935e", -4.402),
+    "magrl/GeomagneticNavigationEddies-v1": ("4fe5c87e60c06f19", 178.059),
 }
 """By id: of eight starts, fields and the ends of a leg; observations and rewards of ten, in one number."""
 FIRST, SIZE = np.array([1, 0]), np.array([25, 1.5])  # of actions in km and rad, from those in [-1, 1]

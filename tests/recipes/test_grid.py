@@ -136,8 +136,8 @@ def node(_: int) -> str:
 
 
 def test_confidence_of_the_command_line_decides_declarations(tmp_path: Path, monkeypatch) -> None:
-    few = replace(tracks.TRACKS["vehicles-v3"], **NEAR, conditions=["ship"])
-    monkeypatch.setitem(tracks.TRACKS, "vehicles-v3", few)
+    few = replace(tracks.TRACKS["vehicles-v4"], **NEAR, conditions=["ship"])
+    monkeypatch.setitem(tracks.TRACKS, "vehicles-v4", few)
     for confidence, ends in ((0.0, "100.0 ± 0.0 / 0.0 ± 0.0"), (1.0, "0.0 ± 0.0 / 0.0 ± 0.0")):
         grid.make(("confidence",), navigators=("geodesic",), trips=2, confidence=confidence, out=tmp_path / "new")
         head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
