@@ -5,7 +5,8 @@
     python docs/examples/sb3.py --algorithm sac --task eddies --num-envs 64 --total-timesteps 50000
     python recipes/sweep.py --command PPO='python docs/examples/sb3.py' -- --task box    # five seeds
 
-Prints the score (magrl.score), and writes the agent, policy.onnx, and its learning curve, train.csv.
+Prints the score (magrl.score) of the best policy by the score on other episodes, and writes it, policy.onnx, and its
+learning curve, train.csv.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Any, Literal
 from magrl import score
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.sb3 import BatchedVecEnv
+from magrl.evaluation.scores import SEED
+from magrl.training.curves import BestPolicy
 
 import numpy as np
 import torch
@@ -28,8 +31,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import Tensor, nn
 
-POINTS = 10
-"""Points of the learning curve."""
+POINTS, VALIDATION_SEED = 20, SEED + 1
+"""Points of the learning curve, and seed of its episodes, by which the policy is selected."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,12 @@ class Config:
     """Gradient steps after each step of all vehicles, of SAC and TD3."""
     learning_rate: float = 1e-3
     """Learning rate of Adam."""
+    gamma: float = 0.97
+    """Discount."""
+    width: int = 128
+    """Width of hidden layers: two of PPO, three of SAC and TD3."""
+    batch_size: int = 256
+    """Transitions per gradient step, of SAC and TD3."""
     episodes: int = 200
     """Episodes of each score."""
     seed: int = 0
@@ -59,21 +68,21 @@ class Config:
 
 
 def make_model(config: Config) -> BaseAlgorithm:
-    """Return an agent, with the networks and discount of the recipes' preset `fast` for SAC and TD3."""
+    """Return an agent."""
     envs = BatchedVecEnv(GeomagneticNavVectorEnv(config.num_envs, task=config.task, autoreset_mode="SameStep"))
-    settings: dict[str, Any] = {"learning_rate": config.learning_rate, "seed": config.seed, "device": "cpu"}
+    settings: dict[str, Any] = {name: getattr(config, name) for name in ("learning_rate", "gamma", "seed")}
+    settings["device"] = "cpu"
     if config.algorithm == "ppo":
-        network = {"net_arch": [64, 64], "log_std_init": -0.5}
+        network = {"net_arch": 2 * [config.width], "log_std_init": -0.5}
         return PPO("MlpPolicy", envs, n_steps=32, batch_size=2048, n_epochs=5, policy_kwargs=network, **settings)
     settings |= {
         "learning_starts": config.learning_starts,
         "train_freq": 1,
         "gradient_steps": config.gradient_steps,
-        "batch_size": 256,
+        "batch_size": config.batch_size,
         "buffer_size": 200_000,
-        "gamma": 0.9,
         "tau": 0.01,
-        "policy_kwargs": {"net_arch": [128, 128, 128]},
+        "policy_kwargs": {"net_arch": 3 * [config.width]},
     }
     if config.algorithm == "td3":
         settings["action_noise"] = NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))
@@ -81,19 +90,19 @@ def make_model(config: Config) -> BaseAlgorithm:
 
 
 class Curve(BaseCallback):
-    """Score the agent at :data:`POINTS` numbers of steps, and write the curve."""
+    """Score the agent at :data:`POINTS` numbers of steps, write the curve, and keep the best policy."""
 
     def __init__(self, config: Config) -> None:
         super().__init__()
-        self.config, self.rows = config, list[dict[str, float]]()
+        self.config, self.rows, self.best = config, list[dict[str, float]](), BestPolicy()
 
-    def point(self) -> dict[str, float]:
-        """Add a point; return the score."""
-        scores = score(self.model, self.config.task, episodes=self.config.episodes)
+    def point(self) -> None:
+        """Add a point."""
+        scores = score(self.model, self.config.task, episodes=self.config.episodes, seed=VALIDATION_SEED)
+        self.best.offer(scores["score"], self.model.policy)
         names = {"score": "eval_score", "SR": "eval_success_rate", "SPL": "eval_spl"}
         self.rows.append({"frames": self.num_timesteps, **{name: scores[key] for key, name in names.items()}})
         DataFrame(self.rows).to_csv(self.config.out / "train.csv", index=False)
-        return scores
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= len(self.rows) * self.config.total_timesteps / POINTS:
@@ -126,7 +135,9 @@ def main(config: Config) -> dict[str, float]:
     config.out.mkdir(parents=True, exist_ok=True)
     model, curve = make_model(config), Curve(config)
     model.learn(config.total_timesteps, callback=curve)
-    scores = curve.point()  # after the last update
+    curve.point()  # after the last update
+    model.policy.load_state_dict(curve.best.weights)
+    scores = score(model, config.task, episodes=config.episodes)
     save_agent(config.out / "policy.onnx", model.policy)
     print(", ".join(f"{name} {value:.2f}" for name, value in scores.items()))
     return scores
