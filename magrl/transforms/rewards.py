@@ -65,10 +65,10 @@ class HighestSPL(StatefulTransform):
     highest SPL in reach: negative where the vehicle is farther than the trip is long, and 0 at the start.
 
     Args:
-        in_keys: true displacement ``(..., 2)`` [km], last leg ``(..., K)`` with the distance [km] first, start position
-            and target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and done.
-        out_keys: the highest SPL ``(..., 1)`` in [0, 1], the earned one ``(..., 1)``, and the path as commanded
-            ``(..., 1)`` [km], which is the state.
+        in_keys: true displacement ``(..., 2)`` [km], last leg ``(..., K)`` with the distance [km] first, and the flags
+            ``(..., 1)`` success and done.
+        out_keys: the highest SPL ``(..., 1)`` in [0, 1], the earned one ``(..., 1)``, and the state: the path as
+            commanded and the distance of the trip ``(..., 1)`` [km].
 
     Raises:
         ValueError: for another number of keys.
@@ -82,29 +82,27 @@ class HighestSPL(StatefulTransform):
         True
     """
 
-    default_in_keys = ("true_displacement", "leg", "start_position", "target_position", "success", "done")
-    default_out_keys = ("highest_spl", "earned_spl", "path_km")
+    default_in_keys = ("true_displacement", "leg", "success", "done")
+    default_out_keys = ("highest_spl", "earned_spl", "path_km", "trip_km")
     out_sizes = dict.fromkeys(default_out_keys, (1,))
 
     @property
     def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the path."""
+        """Keys that a step reads from the TensorDict before it: the path and the distance of the trip."""
         return self.out_keys[2:]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        one = torch.ones_like(values[0][..., :1])
-        self._write_named(tensordict, highest_spl=one, earned_spl=0 * one, path_km=0 * one)
+        trip_km = values[0].norm(dim=-1, keepdim=True).clamp_min(1e-6)  # a trip of no length has an SPL, too
+        one = torch.ones_like(trip_km)
+        self._write_named(tensordict, highest_spl=one, earned_spl=0 * one, path_km=0 * one, trip_km=trip_km)
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        after = self._named(values)
-        start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
-        trip_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["leg"].dtype)
-        trip_km = trip_km.clamp_min(1e-6)  # a trip of no length has an SPL, too
-        path_km, left_km = state[0] + after["leg"][..., :1], after["true_displacement"].norm(dim=-1, keepdim=True)
+        (displacement, leg, success, done), (before_km, trip_km) = values, state
+        path_km, left_km = before_km + leg[..., :1], displacement.norm(dim=-1, keepdim=True)
         whole_km = torch.maximum(torch.where(success, path_km, path_km + left_km), trip_km)
-        highest = (trip_km / whole_km).masked_fill(after["done"] & ~success, 0.0)
+        highest = (trip_km / whole_km).masked_fill(done & ~success, 0.0)
         earned = torch.where(success, trip_km, (trip_km - left_km) / 2) / whole_km
-        self._write_named(tensordict, highest_spl=highest, earned_spl=earned, path_km=path_km)
+        self._write_named(tensordict, highest_spl=highest, earned_spl=earned, path_km=path_km, trip_km=trip_km)
 
 
 class SPLReward(StepReward):

@@ -59,12 +59,9 @@ def test_displacement_leads_to_the_target(latitude: float) -> None:
 
 def test_earned_spl_by_hand() -> None:
     """A trip of 100 km, after 20 km and a leg more: on the way, arrived, failed, carried by a current, and beyond."""
-    target = torch.tensor([[0.0, 0.898315]]).expand(5, 2)  # 100 km to the east
     after = TensorDict(
         true_displacement=torch.tensor([[60.0, 0.0], [3.0, 4.0], [60.0, 0.0], [0.0, 50.0], [120.0, 160.0]]),
         leg=torch.tensor([[40.0, 0.1], [180.0, 0.0], [40.0, 0.0], [20.0, 0.0], [30.0, 0.0]]),
-        start_position=torch.zeros(5, 2),
-        target_position=target,
         success=torch.tensor([[False], [True], [False], [False], [False]]),
         done=torch.tensor([[False], [True], [True], [False], [False]]),
         step_price=torch.full((5, 1), 0.5),
@@ -74,6 +71,7 @@ def test_earned_spl_by_hand() -> None:
         "highest_spl": torch.ones(5, 1),
         "earned_spl": torch.full((5, 1), 0.1),
         "path_km": torch.full((5, 1), 20.0),
+        "trip_km": torch.full((5, 1), 100.0),
     }
     step = HighestSPL()(TensorDict(before | {"next": after}, [5]))
     highest, earned = [100 / 120, 0.5, 0.0, 1.0, 0.4], [100 / 120 * 0.2, 0.5, 100 / 120 * 0.2, 0.25, -0.2]
@@ -87,11 +85,11 @@ def test_earned_spl_by_hand() -> None:
 
 def test_a_trip_of_no_length_has_an_spl() -> None:
     """As :func:`magrl.envs.measures.spl` has it: 1 for who stays, 0 for who comes back."""
-    numbers = {"start_position": 2, "target_position": 2, "true_displacement": 2}
-    after = TensorDict({key: torch.zeros(2, size) for key, size in numbers.items()}, [2])
-    after["leg"], after["success"] = torch.tensor([[0.0, 0.0], [50.0, 0.0]]), torch.ones(2, 1, dtype=torch.bool)
-    after["done"] = after["success"]
-    step = HighestSPL()(TensorDict(path_km=torch.zeros(2, 1), next=after, batch_size=[2]))["next"]
+    flag = torch.ones(2, 1, dtype=torch.bool)
+    legs = {"leg": torch.tensor([[0.0, 0.0], [50.0, 0.0]]), "true_displacement": torch.zeros(2, 2)}
+    after = TensorDict(success=flag, done=flag, **legs, batch_size=[2])
+    start = HighestSPL()(after.clone())
+    step = HighestSPL()(start.set("next", after))["next"]
     torch.testing.assert_close(step["earned_spl"], torch.tensor([[1.0], [0.0]]), rtol=0, atol=1e-6)
 
 
