@@ -47,7 +47,7 @@ def navigation_env(
     Args:
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, scaled to the region: the input of the recipes'
-            networks. ``"legs"`` adds ``observation``, ``(N, 45)``, what a map of the region says of the last eight legs
+            networks. ``"legs"`` adds ``observation``, ``(N, 47)``, what a map of the region says of the last eight legs
             (:class:`~magrl.transforms.RecentLegs`). ``"track"`` adds ``observation``, ``(N, 19)``, estimates of the own
             track (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 26)``, readings without estimates
             (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"dict"`` leaves the public
