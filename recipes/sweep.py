@@ -40,6 +40,7 @@ from magrl.training.curves import draw_seeds
 
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
+from tensordict import TensorDictBase
 from tyro.conf import Positional, UseAppendAction
 
 RECIPE, EPISODES = "sweep.py", 1000
@@ -131,12 +132,15 @@ def run(job: Job) -> DataFrame:
         if not policy_file(job.folder).is_file():
             left = f"left no policy.safetensors or policy.onnx in {job.folder}: save one there"
             raise UsageError(f"{job.folder.name}: {job.line!r} {left}")
-        rollout = flown(job.folder, job.task, episodes=EPISODES)
-        measures = episode_measures(rollout)
-        columns = {"episode": range(EPISODES), "score": episode_scores(rollout), "success": measures["success"].int()}
-        rows = job.rows(columns | {"SPL": measures["spl"], "steps": measures["steps"]})
-        write_episodes(scores, [rows])
+        write_episodes(scores, [job.rows(episodes_of(flown(job.folder, job.task, episodes=EPISODES)))])
     return read_csv(scores)
+
+
+def episodes_of(rollout: TensorDictBase) -> DataFrame:
+    """Return number, score [%], success, SPL and steps of each episode of a rollout."""
+    measures = episode_measures(rollout)
+    columns = {"score": episode_scores(rollout), "success": measures["success"].int(), "SPL": measures["spl"]}
+    return DataFrame({"episode": range(len(rollout)), **columns, "steps": measures["steps"]})
 
 
 def sweep(runs: Sequence[Job], **options: Any) -> DataFrame:

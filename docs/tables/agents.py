@@ -28,7 +28,7 @@ def keep_agents(ends: Iterable[tuple[tuple[str, str], DataFrame]], runs: Path, f
     """Copy the agent of the run with the median score of each algorithm on each task, if it is there.
 
     Args:
-        ends: task and algorithm, and the last points of their runs.
+        ends: task and algorithm, and the scores of their runs.
         runs: folder of the runs.
         folder: folder of the copies.
     """

@@ -4,10 +4,11 @@
     python docs/tables/scores.py                                     # everything: about six hours on two cores
     python docs/tables/scores.py --tasks box --algorithms PPO --seeds 0
     python docs/tables/scores.py --tasks box --algorithms --command mine='python mine.py'    # as of recipes/sweep.py
-    python docs/tables/scores.py --no-train                          # table and figure of docs/results/scores.csv
+    python docs/tables/scores.py --no-train                          # tables and figure of what is known
 
 algorithms.toml has the command of each algorithm for each task, which recipes/sweep.py runs, scores and resumes. The
-rows of a run replace those of the same task, algorithm and seed in docs/results/scores.csv. The agent of the run with
+rows of a run replace those of the same task, algorithm and seed in docs/results/scores.csv, the learning curves, and
+scores.csv.gz, all episodes, with those of references, which are flown if they are missing. The agent of the run with
 the median score is kept in docs/results/agents, for agents.py.
 """
 
@@ -16,33 +17,38 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from agents import keep_agents
-from bars import BARS, bar, bars_of
+from bars import BARS, bars_of, flown
 from flights import write_picture
 from magrl.checks import check_choice
-from magrl.evaluation.tables import markdown_table, mean_of_runs
+from magrl.evaluation.tables import interquartile_mean, markdown_table
+from magrl.evaluation.tracks import write_episodes
 from magrl.files import check_writable, read_document, write_text, write_with
 from magrl.jobs import Backend
 from magrl.named_tasks import NAMED_TASKS, task_name
 from magrl.training import UsageError, command
 from magrl.training.curves import draw_seeds
 
+import numpy as np
+import torch
 import tyro
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat, read_csv
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
-from sweep import Job, curves, named_commands, sweep
+from sweep import Job, curves, episodes_of, named_commands, sweep
 
 ALGORITHMS = read_document(Path(__file__).with_name("algorithms.toml"))
 RUN = ["task", "algorithm", "seed"]
-MEASURES = {"score": "eval_score", "SR": "eval_success_rate", "SPL": "eval_spl"}
+MEASURES = {"eval_score": "score", "eval_success_rate": "SR", "eval_spl": "SPL"}
 """Measures [%], and their columns of learning curves."""
-COLUMNS = [*RUN, "steps", "cpu_s", *MEASURES]
+COLUMNS = [*RUN, "steps", "cpu_s", "score", "SR", "SPL"]
+DRAWS = 2000
+"""Bootstrap samples of an interval."""
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 COLORS = dict(zip(ALGORITHMS, OKABE_ITO, strict=False))
 """Colors of algorithms."""
@@ -88,14 +94,12 @@ def planned(config: Config) -> list[Job]:
     return [Job.of(config.out, task, name, seed, line) for seed, ((task, name), line) in pairs]
 
 
-def rows_of(job: Job, episodes: DataFrame) -> DataFrame:
-    """Return the rows of a run: its learning curve, and its score as the last point."""
-    points = curves([job]).rename(columns={"frames": "steps", **{there: here for here, there in MEASURES.items()}})
-    mean = episodes[["score", "success", "SPL"]].mean()
-    last = {"steps": points["steps"].max() if len(points) else math.nan, "cpu_s": cpu_s(job)}
-    last |= {"score": mean["score"], "SR": 100 * mean["success"], "SPL": 100 * mean["SPL"]}
-    rows = concat([points, DataFrame([last])]).assign(task=job.task, algorithm=job.agent, seed=job.seed)
-    return rows.reindex(columns=COLUMNS).round(2)
+def points_of(job: Job) -> DataFrame:
+    """Return the learning curve of a run; the last point has its CPU time."""
+    points = curves([job]).rename(columns={"agent": "algorithm", "frames": "steps", **MEASURES})
+    last = DataFrame([{"task": job.task, "algorithm": job.agent, "seed": job.seed, "cpu_s": cpu_s(job)}])
+    last["steps"] = points["steps"].max() if len(points) else math.nan
+    return concat([points, last]).reindex(columns=COLUMNS).round(2)
 
 
 def cpu_s(job: Job) -> float:
@@ -104,49 +108,105 @@ def cpu_s(job: Job) -> float:
     return float(lines[-1].split()[2]) if lines.count(job.line) == 1 else math.nan
 
 
-def results(config: Config) -> DataFrame:
-    """Return the rows of all runs, known or trained now."""
-    path, jobs = config.results / "scores.csv", planned(config)
-    check_writable(path)
-    known = read_csv(path) if path.exists() else DataFrame(columns=COLUMNS)
+def results(config: Config) -> tuple[DataFrame, DataFrame]:
+    """Return learning curves and episodes of all runs, known or trained now, and the episodes of the references."""
+    paths, jobs = [config.results / name for name in ("scores.csv", "scores.csv.gz")], planned(config)
+    for path in paths:
+        check_writable(path)
+    points, episodes = (read_csv(path) if path.exists() else DataFrame(columns=RUN) for path in paths)
     if config.train and jobs:
         found = sweep(jobs, jobs=config.jobs, backend=config.backend, address=config.address)
-        by_run = found.groupby(["task", "agent", "seed"])
-        new = concat([rows_of(job, by_run.get_group(job[:3])) for job in jobs])
-        known = concat([known[~known.set_index(RUN).index.isin(new.set_index(RUN).index)], new])
-        write_with(path, known.to_csv, index=False)
-        known = read_csv(path)
-    if known.empty:
-        raise UsageError(f"{path} has no runs, and none of the algorithms {config.algorithms} is trained now")
-    return known
+        episodes = replaced(episodes, found.rename(columns={"agent": "algorithm"}))
+        points = replaced(points, concat(map(points_of, jobs)))
+    if points.empty:
+        raise UsageError(f"{paths[0]} has no runs, and none of the algorithms {config.algorithms} is trained now")
+    known = set(episodes[RUN[:2]].itertuples(index=False, name=None))
+    pairs = [(task, name) for task in points["task"].unique() for name in bars_of(task) if (task, name) not in known]
+    new = [episodes_of(flown(*pair)[1]).assign(task=pair[0], algorithm=pair[1], seed=0) for pair in pairs]
+    episodes = concat([episodes, *new])
+    write_with(paths[0], points.to_csv, index=False)
+    write_episodes(paths[1], [episodes])
+    return points, episodes
 
 
-def ends(curves: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:
+def replaced(known: DataFrame, new: DataFrame) -> DataFrame:
+    """Return rows, of which those of new runs replace the known ones."""
+    return concat([known[~known.set_index(RUN).index.isin(new.set_index(RUN).index)], new])
+
+
+def ends(points: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:
     """Yield task and algorithm, and the last points of their runs."""
-    last = curves.groupby(["task", "algorithm", "seed"], sort=False).last().reset_index()
-    yield from last.groupby(["task", "algorithm"], sort=False)
+    last = points.groupby(RUN, sort=False).last().reset_index()
+    yield from last.groupby(RUN[:2], sort=False)
 
 
-def table(curves: DataFrame) -> str:
-    """Return the Markdown table of final scores, interquartile means with intervals over seeds, and of the bars."""
+def cells(runs: DataFrame, column: str) -> np.ndarray:
+    """Return a column of episodes ``(S, E)``, by seed and number."""
+    return runs.pivot(index="seed", columns="episode", values=column).to_numpy()
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """Return a 95 % bootstrap interval of the interquartile mean over seeds, of episodes ``(S, E)`` that they share.
+
+    Seeds and episodes are drawn anew.
+    """
+    draw, (seeds, count) = np.random.default_rng(0), values.shape
+    means = values @ draw.multinomial(count, np.full(count, 1 / count), size=DRAWS).T / count  # (S, DRAWS)
+    drawn = np.take_along_axis(means, draw.integers(seeds, size=(seeds, DRAWS)), 0)
+    low, high = np.quantile([interquartile_mean(torch.from_numpy(column)) for column in drawn.T], (0.025, 0.975))
+    return float(low), float(high)
+
+
+def middle(values: np.ndarray) -> float:
+    """Return the interquartile mean over seeds of episodes ``(S, E)``."""
+    return interquartile_mean(torch.from_numpy(values.mean(1))).item()
+
+
+def spread(values: np.ndarray, form: str = ".1f") -> str:
+    """Return the interquartile mean of episodes and its interval."""
+    low, high = interval(values)
+    return f"{middle(values):{form}} ({low:{form}} to {high:{form}})"
+
+
+def table(points: DataFrame, episodes: DataFrame) -> str:
+    """Return the Markdown table of scores, with references: interquartile means over seeds, intervals over both."""
+    known, rows = dict(ends(points)), []
+    for task, name in sorted(set(episodes[RUN[:2]].itertuples(index=False, name=None)), key=place_of(episodes)):
+        runs, last = episodes[(episodes["task"] == task) & (episodes["algorithm"] == name)], known.get((task, name))
+        about = ["—", "—"]
+        if last is not None:
+            about = [f"{len(last)} × {last['steps'].max() / 1000:.0f} k", f"{last['cpu_s'].median() / 60:.1f} min"]
+        means = middle(100 * cells(runs, "success")), middle(100 * cells(runs, "SPL")), middle(cells(runs, "steps"))
+        label = name if last is not None else BARS[name]
+        rows.append([task, label, *about, spread(cells(runs, "score")), *(f"{mean:.1f}" for mean in means)])
+    return markdown_table(["task", "agent", "seeds × steps", "CPU", "score %", "SR %", "SPL %", "steps"], rows)
+
+
+def place_of(episodes: DataFrame) -> Callable[[tuple[str, str]], tuple[int, int]]:
+    """Return the order of the rows of a table: tasks, in them algorithms, then references."""
+    names = [*ALGORITHMS, *(name for name in episodes["algorithm"].unique() if name not in BARS), *BARS]
+    return lambda pair: (list(NAMED_TASKS).index(pair[0]), names.index(pair[1]))
+
+
+def against(episodes: DataFrame) -> str:
+    """Return the Markdown table of agents against the strongest reference but oracles, episode by episode."""
     rows = []
-    for (task, name), runs in ends(curves):
-        about = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k", f"{runs['cpu_s'].median() / 60:.1f} min"
-        about = [text.replace("nan min", "—").replace("nan", "—") for text in about]
-        rows.append([task, name, *about, *(mean_of_runs(runs[key], form=".1f", least=2) for key in MEASURES)])
-    for task in curves["task"].unique():
-        for name in bars_of(task):
-            scores = bar(task, name)
-            rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in MEASURES)])
-    rows.sort(key=lambda row: list(NAMED_TASKS).index(row[0]))
-    return markdown_table(["task", "agent", "seeds × steps", "CPU", *(f"{key} %" for key in MEASURES)], rows)
+    for task, flights in episodes.groupby("task", sort=False):
+        by_name = {name: cells(runs, "score") for name, runs in flights.groupby("algorithm", sort=False)}
+        rules = [name for name in by_name if name in BARS and "oracle" not in BARS[name]]
+        best = max(rules, key=lambda name: by_name[name].mean())
+        for name in [name for name in by_name if name not in BARS]:
+            difference = by_name[name][:, : by_name[best].shape[1]] - by_name[best]
+            rows.append([task, name, BARS[best], spread(difference, "+.1f")])
+    return markdown_table(["task", "agent", "strongest reference", "score of the agent less its"], rows)
 
 
-def figure(curves: DataFrame) -> Figure:
+def figure(curves: DataFrame, episodes: DataFrame) -> Figure:
     """Return scores over steps and over CPU time: medians over seeds, bands from the least to the highest, and bars.
 
     The last point of a run, its score, is left out: it is of other episodes.
     """
+    level = episodes.groupby(RUN[:2])["score"].mean()
     tasks = [task for task in NAMED_TASKS if task in set(curves["task"])]
     drawn = Figure(figsize=(12, 3.6 * math.ceil(len(tasks) / 2)), layout="constrained")
     for part, task in zip(drawn.subfigures(math.ceil(len(tasks) / 2), 2, squeeze=False).flat, tasks, strict=False):
@@ -159,7 +219,7 @@ def figure(curves: DataFrame) -> Figure:
         for name in bars_of(task)[::-1]:  # oracle first
             look = {"color": "gray", "ls": STYLES[name], "lw": 1, "label": BARS[name].partition(" (")[0]}
             for axes in both:
-                axes.axhline(bar(task, name)["score"], **look)
+                axes.axhline(level[task, name], **look)
         for axes, text in zip(both, ("steps", "CPU time [min]"), strict=True):
             axes.set(xscale="log", xlabel=text, ylim=(0, 102))
         both[0].set_ylabel("score [%]")
@@ -180,10 +240,12 @@ def main(args: Sequence[str] | None = None) -> None:
     config = replace(config, tasks=tuple(map(task_name, config.tasks)))
     for name in config.algorithms:
         check_choice(ALGORITHMS, algorithm=name)
-    curves = results(config)
-    write_text(config.results / "scores.md", table(curves))
-    keep_agents(ends(curves), config.out, config.results / "agents")
-    write_picture(config.results / "scores.png", figure(curves), config.results / "scores.csv", dpi=130)
+    points, episodes = results(config)
+    write_text(config.results / "scores.md", table(points, episodes))
+    write_text(config.results / "against.md", against(episodes))
+    runs = episodes[~episodes["algorithm"].isin(BARS)].groupby(RUN, sort=False)["score"].mean().reset_index()
+    keep_agents(runs.groupby(RUN[:2], sort=False), config.out, config.results / "agents")
+    write_picture(config.results / "scores.png", figure(points, episodes), config.results / "scores.csv", dpi=130)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from magrl.navigators.kalman import Anywhere as Anywhere
 from magrl.navigators.kalman import Kalman as Kalman
 from magrl.navigators.memory import Memory as Memory
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
-from magrl.navigators.networks import AreaGeometry as AreaGeometry
+from magrl.navigators.networks import Geometry as Geometry
 from magrl.navigators.networks import make_actor as make_actor
 from magrl.navigators.networks import make_correcting_actor as make_correcting_actor
 from magrl.navigators.networks import make_critic as make_critic

@@ -57,27 +57,27 @@ def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm:
     )
 
 
-class AreaGeometry(nn.Module):
-    """A fixed first layer for observations with no-go areas (:class:`~magrl.transforms.NoGoAreas`), without weights.
+class Geometry(nn.Module):
+    """A fixed first layer without weights for observations of one region.
 
-    It adds the differences to the destination in the frame of the heading, if both are observed, and of each area in
-    sight the direction, the distance of the center, and the bearings of the center and of both edges; with an action,
-    also by how much the leg clears each of them. A perceptron learns such products and angles slowly, and the edges
-    decide about a collision.
+    It adds the differences to the destination in the frame of the heading, also over their size, and its logarithm, if
+    both are observed. Of each no-go area in sight (:class:`~magrl.transforms.NoGoAreas`) it adds the direction, the
+    distance of the center, and the bearings of the center and of both edges; with an action, also by how much the leg
+    clears each of them. A perceptron learns such products and angles slowly, and the edges decide about a collision.
 
-    The input is an observation with areas, perhaps with an action ``(..., 2)`` in [-1, 1].
+    The input is an observation, perhaps with an action ``(..., 2)`` in [-1, 1].
 
     Args:
         view: columns of the observation and limits of the action.
 
     Example:
         >>> from magrl.named_tasks import no_go_env
-        >>> geometry = AreaGeometry(no_go_env(seed=0).view)
+        >>> geometry = Geometry(no_go_env(seed=0).view)
         >>> geometry(torch.zeros(5, 25)).shape, geometry(torch.zeros(5, 27)).shape
-        (torch.Size([5, 55]), torch.Size([5, 65]))
+        (torch.Size([5, 62]), torch.Size([5, 72]))
     """
 
-    UNIT_KM, CLEAR_KM = 100.0, 20.0
+    UNIT_KM, CLEAR_KM, LEAST = 100.0, 20.0, 0.01
 
     def __init__(self, view: ObservationView) -> None:
         super().__init__()
@@ -86,7 +86,19 @@ class AreaGeometry(nn.Module):
     def forward(self, observed: Tensor) -> Tensor:
         """Return the input with its features."""
         columns, (seen, action) = self.view.columns, observed.tensor_split([self.view.size], -1)
-        areas = seen[..., columns["areas"]].unflatten(-1, (SEEN, 3))
+        parts = [seen]
+        if {"difference", "heading"} <= columns.keys():
+            difference, heading = (seen[..., columns[name]] for name in ("difference", "heading"))
+            size = difference.norm(dim=-1, keepdim=True) + self.LEAST
+            turned = (difference.unsqueeze(-1) * heading.unsqueeze(-2)).flatten(-2)
+            parts += [turned, turned / size, size.log()]
+        if "areas" in columns:
+            parts += self._of_areas(seen[..., columns["areas"]], action)
+        return torch.cat((*parts, action), -1)
+
+    def _of_areas(self, areas: Tensor, action: Tensor) -> list[Tensor]:
+        """Return the features of areas, and those of an action if there is one."""
+        areas = areas.unflatten(-1, (SEEN, 3))
         ahead, right, size = areas.unbind(-1)
         there, near = size > 0, torch.sqrt(ahead.square() + right.square() + 1e-12)
         radius = RADIUS_KM[1] * size
@@ -96,15 +108,11 @@ class AreaGeometry(nn.Module):
         edges = torch.stack((half, bearing - half, bearing + half), -1) * (2 / math.pi)
         unit = areas[..., :2] / near.clamp_min(1e-4).unsqueeze(-1)
         about = torch.cat((unit, center.unsqueeze(-1) / self.UNIT_KM, edges), -1) * there.unsqueeze(-1)
-        parts = [seen, about.flatten(-2)]
-        if {"difference", "heading"} <= columns.keys():
-            turned = seen[..., columns["difference"]].unsqueeze(-1) * seen[..., columns["heading"]].unsqueeze(-2)
-            parts.insert(1, turned.flatten(-2))
         if not action.shape[-1]:
-            return torch.cat(parts, -1)
+            return [about.flatten(-2)]
         clear_km = self._clear_km(action, center, bearing) - radius
         clear = (clear_km / self.CLEAR_KM).clamp(-1.5, 3.0).where(there, 3.0)
-        return torch.cat((*parts, action, clear, torch.sigmoid(clear_km / 2).where(there, 1.0)), -1)
+        return [about.flatten(-2), clear, torch.sigmoid(clear_km / 2).where(there, 1.0)]
 
     def _clear_km(self, action: Tensor, center: Tensor, bearing: Tensor) -> Tensor:
         """Return the least distance of a leg from centers ``(..., 4)`` [km]."""
@@ -123,13 +131,13 @@ def make_network(
     geometry: ObservationView | None = None,
     device: Device = None,
 ) -> nn.Sequential:
-    """Return a perceptron, perhaps behind :class:`AreaGeometry`; other arguments as of :func:`make_mlp`.
+    """Return a perceptron, perhaps behind :class:`Geometry`; other arguments as of :func:`make_mlp`.
 
     Example:
         >>> make_network(24, 1, (8,), layer_norm=True)(torch.zeros(5, 24)).shape
         torch.Size([5, 1])
     """
-    first = [] if geometry is None else [AreaGeometry(geometry)]
+    first = [] if geometry is None else [Geometry(geometry)]
     size = nn.Sequential(*first)(torch.zeros(inputs)).shape[-1]
     network = make_mlp(size, outputs, num_cells, layer_norm=layer_norm, device=device)
     return nn.Sequential(*first, *network) if geometry else network
@@ -151,7 +159,7 @@ def make_actor(
         observation_size: number of entries K of the observation.
         num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
-        geometry: view of the observation that :class:`AreaGeometry` reads as the first layer, or None.
+        geometry: view of the observation that :class:`Geometry` reads as the first layer, or None.
         device: device of the parameters.
 
     Raises:
@@ -267,7 +275,7 @@ def make_critic(
         observation_size: number of entries K of the observation.
         num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
-        geometry: view of the observation that :class:`AreaGeometry` reads as the first layer, or None.
+        geometry: view of the observation that :class:`Geometry` reads as the first layer, or None.
         device: device of the parameters.
 
     Raises:

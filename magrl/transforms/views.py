@@ -109,7 +109,7 @@ class _View:
 
     @property
     def geometry(self) -> ObservationView | None:
-        """The view, if :class:`~magrl.navigators.networks.AreaGeometry` reads the observation."""
+        """The view, if :class:`~magrl.navigators.networks.Geometry` reads the observation."""
         return None
 
     def __post_init__(self) -> None:
@@ -196,8 +196,8 @@ class ObservationView(_View):
 
     @property
     def geometry(self) -> ObservationView | None:
-        """The view, if it has areas, which :class:`~magrl.navigators.networks.AreaGeometry` reads."""
-        return self if self.observe_areas else None
+        """The view, if :class:`~magrl.navigators.networks.Geometry` adds something to it."""
+        return self if self.observe_areas or (self.observe_heading and self.observe_difference) else None
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys to ``observation`` ``(..., size)``."""

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from magrl.named_tasks import no_go_env
 from magrl.navigators import make_actor
-from magrl.navigators.networks import AreaGeometry, CorrectedLeg
+from magrl.navigators.networks import CorrectedLeg, Geometry
 from magrl.pilot import Rules
 from magrl.transforms import NoGoAreas
 from magrl.transforms.areas import distance_km
@@ -39,6 +39,21 @@ def test_bad_sizes_are_refused() -> None:
             make_actor(size, cells)
 
 
+def test_the_geometry_of_the_destination_turns_with_the_heading() -> None:
+    """Differences and headings that turn together give the same features, whatever the size of the differences."""
+    view = navigation_env(seed=0).view
+    angle = torch.tensor([0.3, 2.0])
+    seen = torch.zeros(2, 13)
+    seen[:, view.columns["difference"]] = torch.tensor([[0.2, -0.1, 0.3], [0.02, -0.01, 0.03]])
+    seen[:, view.columns["heading"]] = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    turned, direction, size = Geometry(view)(seen)[:, 13:].split((6, 6, 1), -1)
+    expected = torch.tensor([0.2, -0.1, 0.3]).outer(torch.tensor([math.cos(0.3), math.sin(0.3)])).flatten()
+    torch.testing.assert_close(turned[0], expected)
+    norms = seen[:, view.columns["difference"]].norm(dim=-1, keepdim=True) + 0.01
+    torch.testing.assert_close(direction, turned / norms)
+    torch.testing.assert_close(size, norms.log())
+
+
 @pytest.mark.parametrize("without", [(), ("observe_difference",), ("observe_difference", "observe_heading")], ids=str)
 @pytest.mark.parametrize("max_leg_km", [50.0, 30.0])
 def test_the_geometry_of_areas_is_that_of_their_discs(max_leg_km: float, without: tuple[str, ...]) -> None:
@@ -50,8 +65,9 @@ def test_the_geometry_of_areas_is_that_of_their_discs(max_leg_km: float, without
     action = 2 * torch.rand(50, 2, generator=generator) - 1
     env = no_go_env(seed=0, max_leg_km=max_leg_km, max_turn_deg=60.0, **dict.fromkeys(without, False))
     before = torch.zeros(50, env.view.size - 12)
-    features = AreaGeometry(env.view.geometry)(torch.cat((before, seen, action), -1))
-    about, _, clear_by, _ = features[:, -34:].split((24, 2, 4, 4), -1)
+    features = Geometry(env.view.geometry)(torch.cat((before, seen, action), -1))
+    about, clear_by, _, kept = features[:, -34:].split((24, 4, 4, 2), -1)
+    torch.testing.assert_close(kept, action)
     order = (centers.norm(dim=-1) - radii).argsort(-1)
     center, radius = centers.take_along_dim(order.unsqueeze(-1), -2), radii.gather(-1, order)
     there = seen.unflatten(-1, (4, 3))[..., 2] > 0

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
 import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import tyro
-from pandas import DataFrame, read_csv
+from pandas import DataFrame, concat, read_csv
 from support.recipes import ROOT, TABLES, load
 from tensordict import TensorDict
 
+from magrl.evaluation.tracks import write_episodes
 from magrl.navigators import Secant
 from magrl.training import parse_config
 from magrl.transforms.areas import CLEAR_KM, RADIUS_KM
@@ -45,10 +48,17 @@ def test_each_command_of_the_file_can_be_given() -> None:
         assert (config.task, config.seed, config.out) == (job.task, 3, Path("runs/x"))
 
 
+def episodes(task: str, algorithm: str, seed: int, score: list[float]) -> DataFrame:
+    about = {"task": task, "algorithm": algorithm, "seed": seed, "episode": range(len(score))}
+    return DataFrame({**about, "score": score, "success": 1, "SPL": [x / 100 for x in score], "steps": 9})
+
+
 def test_rows_of_a_run_replace_its_old_ones(tmp_path: Path, monkeypatch, without_bars) -> None:  # noqa: ARG001
-    """The curve, and the score with the CPU time as its last point; other runs and tasks stay."""
+    """Curve and episodes, and the CPU time as the last point; other runs and tasks stay."""
     text = "task,algorithm,seed,steps,cpu_s,score,SR,SPL\nbox,mine,0,1,1,1,1,1\nbox,PPO,0,5,7.5,85,90,80\n"
     (tmp_path / "scores.csv").write_text(text, encoding="utf-8")
+    known = [episodes("box", "mine", 0, [0.0, 0.0]), episodes("box", "PPO", 0, [85.0, 86.0])]
+    write_episodes(tmp_path / "scores.csv.gz", known)
 
     def swept(runs: list, **options: object) -> DataFrame:
         assert options == {"jobs": 2, "backend": "loky", "address": None}
@@ -59,8 +69,7 @@ def test_rows_of_a_run_replace_its_old_ones(tmp_path: Path, monkeypatch, without
         )
         (job.folder / "policy.safetensors").touch()
         Path(f"{job.folder}.log").write_text("python mine.py\nhello\nCPU time 83.2 s\n", "utf-8")
-        about = {"task": "box", "agent": "mine", "seed": 0, "episode": [0, 1]}
-        return DataFrame({**about, "score": [1.0, 3.0], "success": [0, 1], "SPL": [0.0, 0.9], "steps": 9})
+        return episodes("box", "mine", 0, [1.0, 3.0]).rename(columns={"algorithm": "agent"})
 
     monkeypatch.setattr(scores, "sweep", swept)
     options = ["--tasks", "box", "--seeds", "0", "--algorithms", "--command", "mine=python mine.py"]
@@ -70,32 +79,44 @@ def test_rows_of_a_run_replace_its_old_ones(tmp_path: Path, monkeypatch, without
         ["PPO", 5, 7.5, 85, 90, 80],
         ["mine", 9, -1, 45, 50, 40],
         ["mine", 20, -1, 55, 60, 50],
-        ["mine", 20, 83.2, 2, 50, 45],
+        ["mine", 20, 83.2, -1, -1, -1],
     ]
-    assert "| box | mine | 1 × 0 k | 1.4 min | 2.0 | 50.0 | 45.0 |" in (tmp_path / "scores.md").read_text("utf-8")
+    assert read_csv(tmp_path / "scores.csv.gz")["score"].tolist() == [85.0, 86.0, 1.0, 3.0]
+    assert "| box | mine | 1 × 0 k | 1.4 min | 2.0 (1.0 to 3.0) | 100.0 | 2.0 | 9.0 |" in (
+        tmp_path / "scores.md"
+    ).read_text("utf-8")
     assert (tmp_path / "agents" / "box-mine.safetensors").exists()
-    (tmp_path / "scores.csv").unlink()
-    (tmp_path / "runs" / "box-mine-seed0").rename(tmp_path / "earlier")
-    scores.main([*options, "--out", str(tmp_path / "runs"), "--results", str(tmp_path)])
-    assert len(read_csv(tmp_path / "scores.csv")) == 3
     with (tmp_path / "runs" / "box-mine-seed0.log").open("a", encoding="utf-8") as log:
         log.write("python mine.py\nCPU time 1.0 s\n")
     (job,) = scores.planned(scores.Config(("box",), (), ("mine=python mine.py",), (0,), out=tmp_path / "runs"))
     assert math.isnan(scores.cpu_s(job))  # it was resumed, and its first part is not known
 
 
-@pytest.mark.skipif("score" not in read_csv(RESULTS / "scores.csv", nrows=0), reason="results before the score")
-def test_known_results_are_drawn_without_training(tmp_path: Path, monkeypatch, without_bars) -> None:  # noqa: ARG001
-    (tmp_path / "scores.csv").write_bytes((RESULTS / "scores.csv").read_bytes())
+def test_an_interval_is_of_seeds_and_episodes_and_a_difference_of_pairs() -> None:
+    """Of two seeds that differ by 2, and 1000 episodes of a standard deviation of 10, which pairs have in common."""
+    draw = np.random.default_rng(3)
+    luck = 10 * draw.standard_normal(1000)
+    seeds = np.stack((90 + luck, 92 + luck))
+    low, high = scores.interval(seeds)
+    assert low == pytest.approx(90 + luck.mean() - 1.2 * 0.32, abs=0.35)
+    assert high == pytest.approx(92 + luck.mean() + 1.2 * 0.32, abs=0.35)
+    rows = [episodes("eddies", "TD3", seed, list(values)) for seed, values in enumerate(seeds)]
+    rows += [episodes("eddies", "estimated", 0, list(89 + luck[:200])), episodes("eddies", "mapped", 0, [99.0])]
+    label = scores.BARS["estimated"]
+    assert f"| eddies | TD3 | {label} | +2.0 (+1.0 to +3.0) |" in scores.against(concat(rows))
+
+
+def test_known_results_are_drawn_without_training(tmp_path: Path, monkeypatch) -> None:
+    for name in ("scores.csv", "scores.csv.gz"):
+        (tmp_path / name).write_bytes((RESULTS / name).read_bytes())
     monkeypatch.setattr(scores, "sweep", None)
+    monkeypatch.setattr(scores, "DRAWS", 20)
     scores.main(["--no-train", "--results", str(tmp_path), "--out", str(tmp_path)])
-    own = [line for line in (RESULTS / "scores.md").read_text("utf-8").splitlines() if " × " in line]
-    head, _, *drawn = (tmp_path / "scores.md").read_text("utf-8").splitlines()
-    assert [head, *drawn] == own
-    curves = read_csv(RESULTS / "scores.csv")
-    (axes, *_), runs = scores.figure(curves).subfigs[0].axes, curves[curves["task"] == "box"]
-    ppo = runs[runs["algorithm"] == "PPO"].groupby("seed")[["steps", "score"]].nth(2).median()
-    assert axes.lines[0].get_xydata()[2].tolist() == ppo.tolist()
+    means, own = (
+        [re.sub(r" \(.*? to .*?\)", "", line) for line in (path / "scores.md").open(encoding="utf-8")]
+        for path in (tmp_path, RESULTS)
+    )
+    assert means == own
     assert (tmp_path / "scores.png").exists()
 
 

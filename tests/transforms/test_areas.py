@@ -19,7 +19,7 @@ from magrl.geodesy import geodesic, move_place
 from magrl.named_tasks import no_go_env
 from magrl.navigators import FieldPolicy, PolicyConfig
 from magrl.navigators.names import make_navigator
-from magrl.navigators.networks import AreaGeometry
+from magrl.navigators.networks import Geometry
 from magrl.transforms import NoGoAreas, Shield, TrueDisplacement
 from magrl.transforms.areas import CLEAR_KM, NUMBER, distance_km, outlines, shielded, turned
 
@@ -183,10 +183,11 @@ def test_areas_join_the_observation_alone() -> None:
     assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
 
 
-def test_a_policy_of_areas_sees_their_geometry() -> None:
-    for areas, env in ((True, no_go_env(2)), (False, navigation_env(2))):
+def test_a_policy_sees_the_geometry_of_what_is_observed() -> None:
+    plain = navigation_env(2, observe_difference=False)
+    for geometry, env in ((True, no_go_env(2)), (True, navigation_env(2)), (False, plain)):
         actor = PolicyConfig(env.view, (8,)).make_actor()
-        assert any(isinstance(layer, AreaGeometry) for layer in actor.modules()) == areas
+        assert any(isinstance(layer, Geometry) for layer in actor.modules()) == geometry
 
 
 def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused() -> None:
