@@ -19,7 +19,9 @@ from magrl import score
 from magrl.envs.gymnasium import GeomagneticNavVectorEnv
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.scores import SEED
+from magrl.navigators.networks import Geometry
 from magrl.training.curves import BestPolicy
+from magrl.transforms.views import ObservationView
 
 import numpy as np
 import torch
@@ -29,6 +31,7 @@ from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
 POINTS, VALIDATION_SEED = 20, SEED + 1
@@ -59,6 +62,8 @@ class Config:
     """Width of hidden layers: two of PPO, three of SAC and TD3."""
     batch_size: int = 256
     """Transitions per gradient step, of SAC and TD3."""
+    geometry: bool = False
+    """Whether the fixed layer of the recipes' networks (magrl.navigators.networks.Geometry) is the first one."""
     episodes: int = 200
     """Episodes of each score."""
     seed: int = 0
@@ -67,13 +72,27 @@ class Config:
     """Folder of agent and learning curve."""
 
 
+class Features(BaseFeaturesExtractor):
+    """Observations behind the fixed layer of the recipes' networks."""
+
+    def __init__(self, space: Any, view: ObservationView) -> None:
+        super().__init__(space, Geometry(view)(torch.zeros(view.size)).shape[-1])
+        self.geometry = Geometry(view)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the observation with its features."""
+        return self.geometry(observation)
+
+
 def make_model(config: Config) -> BaseAlgorithm:
     """Return an agent."""
-    envs = BatchedVecEnv(GeomagneticNavVectorEnv(config.num_envs, task=config.task, autoreset_mode="SameStep"))
+    vehicles = GeomagneticNavVectorEnv(config.num_envs, task=config.task, autoreset_mode="SameStep")
+    options = {"features_extractor_class": Features, "features_extractor_kwargs": {"view": vehicles.torchrl_env.view}}
+    envs, first = BatchedVecEnv(vehicles), options if config.geometry else {}
     settings: dict[str, Any] = {name: getattr(config, name) for name in ("learning_rate", "gamma", "seed")}
     settings["device"] = "cpu"
     if config.algorithm == "ppo":
-        network = {"net_arch": 2 * [config.width], "log_std_init": -0.5}
+        network = {"net_arch": 2 * [config.width], "log_std_init": -0.5, **first}
         return PPO("MlpPolicy", envs, n_steps=32, batch_size=2048, n_epochs=5, policy_kwargs=network, **settings)
     settings |= {
         "learning_starts": config.learning_starts,
@@ -82,7 +101,7 @@ def make_model(config: Config) -> BaseAlgorithm:
         "batch_size": config.batch_size,
         "buffer_size": 200_000,
         "tau": 0.01,
-        "policy_kwargs": {"net_arch": 3 * [config.width]},
+        "policy_kwargs": {"net_arch": 3 * [config.width], **first},
     }
     if config.algorithm == "td3":
         settings["action_noise"] = NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))

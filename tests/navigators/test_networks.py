@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from magrl.envs.navigation import navigation_env
 from magrl.named_tasks import no_go_env
 from magrl.navigators import make_actor
 from magrl.navigators.networks import CorrectedLeg, Geometry
