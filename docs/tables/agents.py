@@ -1,7 +1,7 @@
 """Score the agents that scores.py kept again, and print a row for each.
 
     pip install -c constraints.txt -e '.[recipes,onnx]'
-    python docs/tables/agents.py docs/results/agents/*    # a minute
+    python docs/tables/agents.py magrl/navigators/pretrained/*-*    # a minute
 
 A file is named by its task and algorithm, as in ``box-PPO.onnx``. Intervals are over 200 episodes.
 """

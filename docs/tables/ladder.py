@@ -21,7 +21,7 @@ from magrl.training import command
 import tyro
 from tqdm import tqdm
 
-NOGO = "docs/results/agents/nogo-TD3-magrl.safetensors"
+NOGO = "nogo-TD3"
 STORM = weather_record("college")
 COLUMNS = ("easier", "the named task", "harder", "with noise")
 

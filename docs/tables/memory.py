@@ -29,7 +29,7 @@ import tyro
 from torch import Tensor
 
 AGENTS = {"memory": "memory (pretrained), trained on storm"}
-AGENTS |= {"docs/results/agents/readings-ppo_memory.safetensors": "memory, trained on readings"}
+AGENTS |= {"readings-ppo_memory": "memory, trained on readings"}
 AGENTS |= {name: BARS[name] for name in ("kalman", "anywhere", "secant")}
 TOLD = BARS["told"]
 

@@ -9,7 +9,7 @@
 algorithms.toml has the command of each algorithm for each task, which recipes/sweep.py runs, scores and resumes. The
 rows of a run replace those of the same task, algorithm and seed in docs/results/scores.csv, the learning curves, and
 scores.csv.gz, all episodes, with those of references, which are flown if they are missing. The agent of the run with
-the median score is kept in docs/results/agents, for agents.py.
+the median score is shipped with magrl, by the name TASK-ALGORITHM.
 """
 
 from __future__ import annotations
@@ -82,6 +82,8 @@ class Config:
     """Folder of the runs."""
     results: Path = Path("docs/results")
     """Folder of table, data and figure."""
+    agents: Path = Path("magrl/navigators/pretrained")
+    """Folder of the agents."""
 
 
 def planned(config: Config) -> list[Job]:
@@ -194,8 +196,8 @@ def against(episodes: DataFrame) -> str:
     for task, flights in episodes.groupby("task", sort=False):
         by_name = {name: cells(runs, "score") for name, runs in flights.groupby("algorithm", sort=False)}
         rules = [name for name in by_name if name in BARS and "oracle" not in BARS[name]]
-        best = max(rules, key=lambda name: by_name[name].mean())
-        for name in [name for name in by_name if name not in BARS]:
+        for name in [name for name in by_name if rules and name not in BARS]:
+            best = max(rules, key=lambda rule: by_name[rule].mean())
             difference = by_name[name][:, : by_name[best].shape[1]] - by_name[best]
             rows.append([task, name, BARS[best], spread(difference, "+.1f")])
     return markdown_table(["task", "agent", "strongest reference", "score of the agent less its"], rows)
@@ -244,7 +246,7 @@ def main(args: Sequence[str] | None = None) -> None:
     write_text(config.results / "scores.md", table(points, episodes))
     write_text(config.results / "against.md", against(episodes))
     runs = episodes[~episodes["algorithm"].isin(BARS)].groupby(RUN, sort=False)["score"].mean().reset_index()
-    keep_agents(runs.groupby(RUN[:2], sort=False), config.out, config.results / "agents")
+    keep_agents(runs.groupby(RUN[:2], sort=False), config.out, config.agents)
     write_picture(config.results / "scores.png", figure(points, episodes), config.results / "scores.csv", dpi=130)
 
 

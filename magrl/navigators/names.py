@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +38,7 @@ _GUIDED = Agent("gg_td3", "Gradient-Guided TD3", "Gradient-Guided TD3", "the reg
 _PLAIN = Agent("td3", "TD3", "TD3", "the region")
 _EDDIES = Agent("eddies", "eddies (TD3)", "eddies (TD3)", "eddies in the paper's region", "a map of the field")
 PRETRAINED = {"eddies": _EDDIES}
-"""Agents that ship as files of :func:`magrl.save_policy`, by name."""
+"""Agents of the table of scores with a name of their own; the others are named as in ``"nogo-TD3"``."""
 KINDS: dict[str, Kind] = {"gg_td3": _GUIDED, "td3": _PLAIN, **NAVIGATORS, **PRETRAINED}
 """What navigators are, by their names in results: the paper's agents, and navigators that commands name."""
 NAMES = (*NAVIGATORS, *PRETRAINED)
@@ -62,8 +63,8 @@ def named(text: str) -> Named:
     """Return what a text names: a navigator by its name, or the agent in a file or run folder, ``[LABEL=]PATH``.
 
     Args:
-        text: ``secant``, ``sac.onnx``, ``runs/first``, ``SAC=sac.onnx``. The label replaces the one that follows from
-            the file.
+        text: ``secant``, ``nogo-TD3``, ``sac.onnx``, ``runs/first``, ``SAC=sac.onnx``. The label replaces the one that
+            follows from the file.
 
     Raises:
         ValueError: for an unknown name, or a file that holds no policy.
@@ -77,7 +78,9 @@ def named(text: str) -> Named:
     if text in NAVIGATORS:
         return Named(NAVIGATORS[text])
     if text in PRETRAINED:
-        return Named(PRETRAINED[text], file := pretrained(text), file)
+        return Named(PRETRAINED[text], file := pretrained("eddies-TD3"), file)
+    if text in scored_agents():
+        return Named(_agent_of(file := pretrained(text))[0], file, file)
     label, _, path = ("", "", text) if _exists(text) or "=" not in text else text.partition("=")
     if label in KINDS:
         raise ValueError(f"{short(text)}: the name {label} follows from a file: leave it out, or choose another label")
@@ -87,6 +90,18 @@ def named(text: str) -> Named:
     if label:
         kind = Agent(label, label, label, kind.trained_on, kind.needs)
     return Named(kind, Path(path), file)
+
+
+@cache
+def scored_agents() -> list[str]:
+    """Return the names of the agents of the table of scores, each of its task: ``"nogo-TD3"``.
+
+    Example:
+        >>> "eddies-TD3" in scored_agents()
+        True
+    """
+    names = [path.stem for path in pretrained("anywhere").parent.iterdir() if path.suffix in (".onnx", ".safetensors")]
+    return sorted(name for name in names if "-" in name)
 
 
 def _exists(path: str) -> bool:

@@ -84,7 +84,7 @@ def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
 
 
 def pretrained(name: str) -> Path:
-    """Return the file of a pretrained pilot; beside it is a card with its training, figures and limits.
+    """Return the file of a pretrained agent, such as ``"anywhere"`` or ``"nogo-TD3"``, of the table of scores.
 
     Raises:
         ValueError: for an unknown name, listing the known ones.
@@ -93,8 +93,9 @@ def pretrained(name: str) -> Path:
         >>> pretrained("anywhere").name
         'anywhere.safetensors'
     """
-    check_choice(sorted(path.stem for path in _PRETRAINED.glob("*.safetensors")), pretrained_policy=name)
-    return _PRETRAINED / f"{name}.safetensors"
+    files = {path.stem: path for path in sorted(_PRETRAINED.iterdir()) if path.suffix in (".onnx", ".safetensors")}
+    check_choice(files, pretrained_policy=name)
+    return files[name]
 
 
 def pilot_of(navigator: str | Path | nn.Module) -> tuple[Rules, nn.Module | None] | None:

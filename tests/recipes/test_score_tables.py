@@ -73,7 +73,9 @@ def test_rows_of_a_run_replace_its_old_ones(tmp_path: Path, monkeypatch, without
 
     monkeypatch.setattr(scores, "sweep", swept)
     options = ["--tasks", "box", "--seeds", "0", "--algorithms", "--command", "mine=python mine.py"]
-    scores.main([*options, "--out", str(tmp_path / "runs"), "--results", str(tmp_path)])
+    scores.main(
+        [*options, "--out", str(tmp_path / "runs"), "--results", str(tmp_path), "--agents", str(tmp_path / "agents")]
+    )
     rows = read_csv(tmp_path / "scores.csv")
     assert rows[["algorithm", "steps", "cpu_s", "score", "SR", "SPL"]].fillna(-1).to_numpy().tolist() == [
         ["PPO", 5, 7.5, 85, 90, 80],
@@ -111,7 +113,7 @@ def test_known_results_are_drawn_without_training(tmp_path: Path, monkeypatch) -
         (tmp_path / name).write_bytes((RESULTS / name).read_bytes())
     monkeypatch.setattr(scores, "sweep", None)
     monkeypatch.setattr(scores, "DRAWS", 20)
-    scores.main(["--no-train", "--results", str(tmp_path), "--out", str(tmp_path)])
+    scores.main(["--no-train", "--results", str(tmp_path), "--out", str(tmp_path), "--agents", str(tmp_path)])
     means, own = (
         [re.sub(r" \(.*? to .*?\)", "", line) for line in (path / "scores.md").open(encoding="utf-8")]
         for path in (tmp_path, RESULTS)

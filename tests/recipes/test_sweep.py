@@ -38,7 +38,7 @@ if seed == "6" and not Path("again").exists():  # another one, which fails late
     print("Traceback\\nValueError: no luck", file=sys.stderr)
     sys.exit(1)
 if seed != "7":
-    agent = "eddies" if seed == "0" else "memory"
+    agent = "eddies-TD3" if seed == "0" else "memory"
     shutil.copy(f"{PRETRAINED}/{{agent}}.safetensors", out / "policy.safetensors")
 (out / "train.csv").write_text(f"frames,return,eval_score\\n100,1,{{seed}}0\\n150,2,\\n200,3,50\\n")
 """
@@ -71,7 +71,7 @@ def test_each_seed_is_trained_once_and_scored_as_by_the_library(capsys) -> None:
     assert list(scores) == ["task", "agent", "seed", "episode", "score", "success", "SPL", "steps"]
     assert scores[["task", "agent"]].drop_duplicates().to_numpy().tolist() == [["box", "mine"]]
     assert scores["episode"].tolist() == [*range(8), *range(8)]
-    for seed, agent in enumerate(("eddies", "memory")):
+    for seed, agent in enumerate(("eddies-TD3", "memory")):
         mean, wanted = scores[scores["seed"] == seed].mean(numeric_only=True), score(agent, "box", episodes=8)
         shown = {
             "score": mean["score"],
@@ -111,7 +111,7 @@ def test_a_complete_run_of_a_recipe_is_scored_without_its_command() -> None:
         run(5)
     folder = Path("mine/box-mine-seed5")
     (folder / "eval.json").touch()
-    (folder / "policy.safetensors").write_bytes((PRETRAINED / "eddies.safetensors").read_bytes())
+    (folder / "policy.safetensors").write_bytes((PRETRAINED / "eddies-TD3.safetensors").read_bytes())
     run(5)
     assert len(calls()) == 1
     assert not Path("mine/curves.png").exists()
