@@ -10,7 +10,6 @@ import json
 import re
 import runpy
 import shlex
-import shutil
 import sys
 from functools import cache
 from itertools import chain
@@ -41,7 +40,7 @@ BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
 SCRIPTS = [
     ROOT / "docs" / "examples" / f"{name}.py"
-    for name in ("autopilot", "ins", "navigator", "sac", "sb3_anywhere", "turns")
+    for name in ("autopilot", "ins", "lamps", "navigator", "sac", "sb3_anywhere", "turns")
 ]
 EXAMPLES += [(path, path.read_text(encoding="utf-8")) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
@@ -117,8 +116,6 @@ def reader(tmp_path_factory) -> Path:
     (folder / "runs" / "first").mkdir(parents=True)
     policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
     save_policy(folder / "runs" / "first" / "policy.safetensors", policy)
-    (folder / "docs" / "examples").mkdir(parents=True)
-    shutil.copy(ROOT / "docs/examples/log.csv", folder / "docs/examples")
     return folder
 
 
