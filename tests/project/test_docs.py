@@ -22,7 +22,7 @@ from support.recipes import load
 from torchrl.data import Composite
 
 import magrl
-from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
+from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, planet_scenario
 from magrl.errors import CONDITIONS
 from magrl.evaluation.tracks import read_episodes
 from magrl.files import read_document
