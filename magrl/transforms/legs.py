@@ -167,9 +167,11 @@ class CurrentReading(EpisodeNumbers):
             ``(..., 2)`` forward and to the right.
 
     Example:
-        >>> from magrl.named_tasks import eddies_env
-        >>> state = eddies_env(2, seed=0).reset()  # heading north
-        >>> torch.allclose(state["current"].norm(dim=-1), state["true_current"].norm(dim=-1), atol=0.01)
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env = TransformedEnv(base, Compose(Fix(base.field, base.region), CurrentReading(base.field)))
+        >>> bool((env.rollout(3)["next", "current"].abs() < 0.01).all())  # in water without currents
         True
     """
 
