@@ -1,6 +1,6 @@
-"""Make the ladder of the named tasks: the same agents where a task is easier or harder.
+"""Make the ladder of the named tasks: the same agents where a task is easier or harder, and where none was trained.
 
-python docs/tables/ladder.py    # docs/results/ladder.md; some minutes
+python docs/tables/ladder.py    # docs/results/ladder.md and elsewhere.md; some minutes
 """
 
 from __future__ import annotations
@@ -10,12 +10,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bars import BARS, flown
+from magrl.envs import Region, planet_scenario
 from magrl.errors import SensorErrors
-from magrl.evaluation.scores import scored
+from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
 from magrl.field.weather import weather_record
 from magrl.files import write_text
-from magrl.named_tasks import storm_errors
+from magrl.named_tasks import NAMED_TASKS, storm_errors
+from magrl.navigators import FieldPolicy, load_policy
+from magrl.navigators.names import named
 from magrl.training import command
 
 import tyro
@@ -44,11 +48,30 @@ LADDERS = (
 )
 
 
-def main(out: Path = Path("docs/results/ladder.md"), vehicles: int = 1000) -> None:
-    """Fly all agents on all levels, and write the table.
+REGIONS = {
+    "the task's region": {},
+    "Azores": {"region": Region((35, 45), (-35, -25))},
+    "a random planet": {"scenario": planet_scenario(1, seed=1, distance_range_km=(300.0, 500.0))},
+}
+"""Regions of agents of one region, by their columns."""
+TRAINED = (("box", "box-TD3"), ("box", "box-GG-TD3"), ("nogo", "nogo-TD3"), ("eddies", "eddies-TD3"))
+
+
+def elsewhere(task: str, agent: str, vehicles: int, options: dict[str, Any]) -> str:
+    """Return success rate and SPL of an agent in a region, without training there, behind the scaling of the region."""
+    env = NAMED_TASKS[task].make(vehicles, seed=SEED, **options)
+    policy = load_policy(named(agent).file)
+    moved = FieldPolicy(replace(policy.config, view=env.base_env.view), policy.actor)
+    dictionary = NAMED_TASKS[task].make(vehicles, observation="dict", scale_actions=False, seed=SEED, **options)
+    score = scored(evaluation_rollout(dictionary, moved))
+    return f"{score['SR']:.1f} / {score['SPL']:.1f}"
+
+
+def main(out: Path = Path("docs/results"), vehicles: int = 1000) -> None:
+    """Fly all agents on all levels, and write the tables.
 
     Args:
-        out: File of the table, which is replaced.
+        out: Folder of the tables.
         vehicles: Number of episodes.
     """
     rows = []
@@ -57,7 +80,9 @@ def main(out: Path = Path("docs/results/ladder.md"), vehicles: int = 1000) -> No
         cells = [f"{score['SR']:.1f} / {score['SPL']:.1f}" for score in scores]
         label = BARS.get(agent, Path(agent).stem.partition("-")[2] or agent)
         rows.append([task, label, *cells, *["—"] * (len(COLUMNS) - len(cells))])
-    write_text(out, markdown_table(["task", "agent", *COLUMNS], rows) + "\n")
+    write_text(out / "ladder.md", markdown_table(["task", "agent", *COLUMNS], rows) + "\n")
+    rows = [[task, agent, *(elsewhere(task, agent, vehicles, o) for o in REGIONS.values())] for task, agent in TRAINED]
+    write_text(out / "elsewhere.md", markdown_table(["task", "agent", *REGIONS], rows) + "\n")
 
 
 if __name__ == "__main__":
