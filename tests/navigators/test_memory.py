@@ -64,7 +64,7 @@ POLICIES: dict[str, tuple[Callable[[], Any], Callable[..., EnvBase]]] = {
     "function": (lambda: ArrayPolicy(act), named("readings")),
     "detour": (Detour, named("nogo", **DICT)),
     "sighted": (Sighted, named("nogo", **DICT)),
-    "around": (lambda: Around(Secant()), named("nogo", **DICT)),
+    "around": (Around, named("nogo", **DICT)),
 }
 """Each kind of policy, and its environment by a seed."""
 
