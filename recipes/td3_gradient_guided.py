@@ -25,7 +25,7 @@ from magrl.envs.specs import REWARD_TERMS
 from magrl.errors import SensorErrors
 from magrl.named_tasks import NAMED_TASKS
 from magrl.navigators import FieldPolicy, PolicyConfig, make_critic
-from magrl.training import Run, SoftUpdate, TD3Loss, command, optimize, parse_config, saturation_penalty
+from magrl.training import Run, SoftUpdate, TD3Loss, command, mirrored, optimize, parse_config, saturation_penalty
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RegionConfig, make_presets, read_presets
 from magrl.transforms import DistanceCost, EpisodeSum, Shield
@@ -206,7 +206,8 @@ def train(config: Config) -> dict[str, float]:
         parts = {"critic_optimizer": critic_optimizer, "actor_optimizer": actor_optimizer, "noise": noise}
         parts |= {"loss": loss, "buffer": buffer}
         run.start(policy=policy, validation=validation, env=env.base_env, collector=collector, **parts)
-        stats = run.statistics
+        stats, mirror = run.statistics, env.view.mirror
+        mirror = None if mirror is None else mirror.to(env.device)
         for batch in run.batches():
             buffer.extend(batch.reshape(-1).select(*TRANSITION))
             noise.step()
@@ -217,7 +218,8 @@ def train(config: Config) -> dict[str, float]:
                 optimizer.param_groups[0]["lr"] = rate
             if len(buffer) < config.batch_size:
                 continue
-            for transitions in buffer.sample().split(config.batch_size):
+            for sample in buffer.sample().split(config.batch_size):
+                transitions = mirrored(sample, mirror)
                 stats.losses["loss_critic"], values = loss.value_loss(transitions)
                 stats.losses["q_value"] = values["target_value"].mean()
                 optimize(stats.losses["loss_critic"], critic_optimizer)

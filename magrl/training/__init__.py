@@ -9,5 +9,6 @@ from magrl.training.config import parse_config as parse_config
 from magrl.training.run import Run as Run
 from magrl.training.td3 import SoftUpdate as SoftUpdate
 from magrl.training.td3 import TD3Loss as TD3Loss
+from magrl.training.td3 import mirrored as mirrored
 from magrl.training.td3 import optimize as optimize
 from magrl.training.td3 import saturation_penalty as saturation_penalty

@@ -168,6 +168,31 @@ class SoftUpdate:
                 target.lerp_(source, self.tau)
 
 
+def mirrored(transitions: TensorDictBase, signs: Tensor | None) -> TensorDictBase:
+    """Return transitions, of which a random half are in mirror image; without signs, as they are.
+
+    Args:
+        transitions: ``(B,)`` with ``observation``, ``action`` and ``next``.
+        signs: ``(K,)`` of an observation in the mirror image, as of :attr:`magrl.transforms.LegsView.mirror`; a turn
+            changes its sign, too.
+
+    Example:
+        >>> after = TensorDict(observation=torch.ones(9, 2), batch_size=[9])
+        >>> batch = TensorDict(observation=torch.ones(9, 2), action=torch.ones(9, 2), next=after, batch_size=[9])
+        >>> found = mirrored(batch, torch.tensor([1.0, -1.0]))
+        >>> torch.equal(found["action"], found["next", "observation"])
+        True
+    """
+    if signs is None:
+        return transitions
+    drawn = torch.rand(*transitions.shape, 1, device=signs.device) < 0.5
+    observed, turned = torch.where(drawn, signs, 1.0), torch.where(drawn, signs.new_tensor((1.0, -1.0)), 1.0)
+    found = transitions.copy()
+    found["observation"], found["action"] = found["observation"] * observed, found["action"] * turned
+    found["next", "observation"] = found["next", "observation"] * observed
+    return found
+
+
 def saturation_penalty(logits: Tensor) -> Tensor:
     """Return the mean square of the actor's outputs before the tanh.
 

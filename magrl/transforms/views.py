@@ -112,6 +112,11 @@ class _View:
         """The view, if :class:`~magrl.navigators.networks.Geometry` reads the observation."""
         return None
 
+    @property
+    def mirror(self) -> Tensor | None:
+        """Signs ``(size,)`` of an observation in the mirror image of an episode, if that is one of the task, too."""
+        return None
+
     def __post_init__(self) -> None:
         check_number(0, above=True, max_leg_km=self.max_leg_km)
         check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
@@ -285,6 +290,11 @@ class LegsView(_View):
     def size(self) -> int:
         """Number of entries of ``observation``."""
         return RecentLegs(self.count).size + CurrentReading.size
+
+    @property
+    def mirror(self) -> Tensor:
+        """Signs ``(size,)`` of an observation in the mirror image of an episode: what is to the right changes its."""
+        return torch.tensor([1.0, -1, 1, 1, 1, *self.count * [1, -1, 1, -1, 1], 1, -1])
 
     def needed(self, env: EnvBase) -> list[Transform]:
         """Return the transforms that write what is observed, with the map of an environment."""

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from support.environments import paper_env
+from tensordict import TensorDict
 from torch import Tensor
 from torch.testing import assert_close
 from torchrl.envs import Compose, TransformedEnv
@@ -21,6 +22,7 @@ from magrl.named_tasks import eddies_env
 from magrl.transforms import Fix, RecentLegs
 from magrl.transforms.areas import turned
 from magrl.transforms.sequences import per_nanotesla
+from magrl.transforms.views import LegsView
 
 BASE = paper_env(1)
 MAP = Fix(BASE.field, BASE.region.expanded(5.0))
@@ -153,3 +155,24 @@ def test_the_observation_follows_from_readings_and_legs_alone() -> None:
     assert_close(legs[1](seen)["next", "recent_legs"], steps["next", "recent_legs"])
     both = torch.cat((steps["next", "recent_legs"], steps["next", "current"]), -1)
     assert_close(steps["next", "observation"], both)
+
+
+def test_a_mirror_image_is_an_episode_of_the_task() -> None:
+    """Places and currents that are mirrored in the meridian of a dipole: the observation is that of the signs."""
+    env = eddies_env(4, seed=0)
+    recent, view = RecentLegs(3, 60), LegsView(count=3, max_steps=60, max_leg_km=25.0, max_turn_rad=1.5)
+    state = env.reset()
+    east = torch.tensor([1.0, -1.0], dtype=torch.float64)
+
+    def flown(sign: Tensor) -> Tensor:
+        fix, target, heading = (torch.tensor(x, dtype=torch.float64) for x in ([1.0, 2.0], [3.0, -1.0], [0.4]))
+        step = TensorDict(
+            fix=fix * sign, target_fix=target * sign, leg=torch.tensor([9.0, 0.1]), heading=heading * sign[1:]
+        )
+        step["elapsed_steps"] = torch.tensor([1])
+        step = recent(step)
+        after = step.clone().set("fix", (fix + 0.1) * sign).set("heading", (heading + 0.3) * sign[1:])
+        return recent(step.set("next", after))["next", "recent_legs"]
+
+    assert state["observation"].shape[-1] == env.view.size == len(env.view.mirror)
+    assert_close(flown(east), flown(torch.ones(2, dtype=torch.float64)) * view.mirror[:-2].double(), atol=1e-9, rtol=0)
