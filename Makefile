@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format docs docs-slow bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format lock docs docs-slow bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -43,6 +43,13 @@ check: $(VENV)/.installed-dev  ## check lint, format and types
 format: $(VENV)/.installed-dev  ## format the code
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
+
+lock:  ## write constraints.txt with the newest versions of all but torch, from an environment in build/lock
+	rm -rf build/lock
+	$(MAKE) VENV=build/lock CONSTRAINTS=/dev/null build/lock/.installed-dev build/lock/.installed-docs
+	build/lock/bin/pip freeze --all --exclude pip --exclude magrl > build/lock/versions.txt
+	sed -i 's/+.*//; /^\(cuda\|nvidia\|triton\)/d; 1e head -n 1 constraints.txt' build/lock/versions.txt
+	mv build/lock/versions.txt constraints.txt
 
 SPHINX := $(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet
 
@@ -109,19 +116,20 @@ clean:  ## remove .venv and build outputs
 	rm -rf $(VENV) build .coverage *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
 # Install torch first, so that no other package installs another build of it. Modules are compiled at their first import.
+CONSTRAINTS := constraints.txt
 PIP := $(RUN)/pip install -qq --no-compile --disable-pip-version-check
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "Installing torch, TorchRL and what the recipes need in $(VENV): one to three minutes"
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) $$(grep '^torch==' constraints.txt)
-	@$(PIP) -c constraints.txt -e '.[recipes]'
+	@$(PIP) -c $(CONSTRAINTS) -e '.[recipes]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	@$(PIP) -c constraints.txt -e '.[dev]'
+	@$(PIP) -c $(CONSTRAINTS) -e '.[dev]'
 	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
-	@$(PIP) -c constraints.txt -e '.[docs]'
+	@$(PIP) -c $(CONSTRAINTS) -e '.[docs]'
 	@touch $@

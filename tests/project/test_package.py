@@ -1,11 +1,11 @@
-"""What a user gets with `pip install`: the wheel, alone, in an environment that has never seen this tree."""
+"""What a user gets with `pip install`: of this tree, or the wheel in an environment that has never seen it."""
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -15,7 +15,6 @@ import pytest
 import magrl
 
 ROOT = Path(__file__).parent.parent.parent
-LEFT_OUT = shutil.ignore_patterns(".*", "runs", "build", "dist", "wandb", "figures", "*.egg-info", "__pycache__")
 TOUR = """
 import sys
 from importlib.metadata import version
@@ -65,15 +64,17 @@ def run(*command: object, cwd: Path) -> str:
     return done.stdout
 
 
+def built(kind: str, folder: Path) -> Path:
+    """Return the wheel, editable wheel or sdist of this tree, which the build leaves as it is."""
+    build = f"import hatchling.build as backend, sys; backend.build_{kind}(sys.argv[1])"
+    run(sys.executable, "-c", build, folder, cwd=ROOT)
+    (archive,) = folder.glob("magrl-*")
+    return archive
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """Built from a copy of the tree: a build leaves files beside the source."""
-    folder = tmp_path_factory.mktemp("wheel")
-    shutil.copytree(ROOT, folder / "tree", ignore=LEFT_OUT)
-    build = "import sys, setuptools.build_meta as backend; backend.build_wheel(sys.argv[1])"
-    run(sys.executable, "-c", build, folder, cwd=folder / "tree")
-    (built,) = folder.glob("*.whl")
-    return built
+    return built("wheel", tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +91,41 @@ def python(wheel: Path, tmp_path_factory) -> Path:
     return executable
 
 
-def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
+def files_of(*folders: str) -> set[str]:
+    """Return the files in some folders of this tree, by their path in it."""
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    return {str(path.relative_to(ROOT)) for path in files if path.suffix != ".pyc"}
+
+
+def test_wheel_holds_the_library_its_licenses_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        held = {Path(name) for name in archive.namelist()}
-    files = {path for path in (ROOT / "magrl").rglob("*") if path.is_file() and path.suffix != ".pyc"}
-    assert {path for path in held if path.parts[0] == "magrl"} == {path.relative_to(ROOT) for path in files}
-    (other,) = {path.parts[0] for path in held} - {"magrl"}
-    assert other.endswith(".dist-info")
-    assert any(path.name == "LICENSE" for path in held)
+        held = set(archive.namelist())
+    about = f"magrl-{magrl.__version__}.dist-info"
+    assert {name for name in held if not name.startswith(about)} == files_of("magrl")
+    assert {f"{about}/licenses/LICENSE", f"{about}/licenses/NOTICE"} <= held
+
+
+def test_the_notice_names_the_data_of_others() -> None:
+    """All data of the library but its own: policies, and the errors of sensors, which are chosen."""
+    data = {name for name in files_of("magrl") if not name.endswith((".py", ".pyi", ".toml", "py.typed"))}
+    notice = re.findall(r"^magrl/\S+", (ROOT / "NOTICE").read_text(encoding="utf-8"), re.MULTILINE)
+    assert {name for name in data if "/pretrained/" not in name} == set(notice)
+
+
+def test_sdist_holds_what_the_tests_need(tmp_path: Path) -> None:
+    with tarfile.open(built("sdist", tmp_path)) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    assert files_of("magrl", "recipes", "tests", "docs", "benchmarks") <= held
+    assert {"LICENSE", "NOTICE", "Makefile", "conftest.py", "constraints.txt", "pyproject.toml", "README.md"} <= held
+
+
+def test_editable_install_is_found_beside_a_folder_of_the_same_name(tmp_path: Path) -> None:
+    """As in the folder above a clone: Python takes it for a namespace package if no path holds the library."""
+    with zipfile.ZipFile(built("editable", tmp_path)) as archive:
+        archive.extractall(tmp_path / "site")
+    (tmp_path / "magrl").mkdir()
+    find = "import importlib.util as i, site; site.addsitedir('site'); print(i.find_spec('magrl').origin)"
+    assert run(sys.executable, "-S", "-c", find, cwd=tmp_path).strip() == str(ROOT / "magrl" / "__init__.py")
 
 
 def test_the_hook_before_a_commit_has_the_version_of_ruff() -> None:
