@@ -47,9 +47,10 @@ format: $(VENV)/.installed-dev  ## format the code
 lock:  ## write constraints.txt with the newest versions of all but torch, from an environment in build/lock
 	rm -rf build/lock
 	$(MAKE) VENV=build/lock CONSTRAINTS=/dev/null build/lock/.installed-dev build/lock/.installed-docs
-	build/lock/bin/pip freeze --all --exclude pip --exclude magrl > build/lock/versions.txt
-	sed -i 's/+.*//; /^\(cuda\|nvidia\|triton\)/d; 1e head -n 1 constraints.txt' build/lock/versions.txt
-	mv build/lock/versions.txt constraints.txt
+	build/lock/bin/pip freeze --all --exclude pip --exclude magrl > build/lock/versions
+	head -n 1 constraints.txt > build/lock/constraints.txt
+	sed 's/+.*//; /^\(cuda\|nvidia\|triton\)/d' build/lock/versions >> build/lock/constraints.txt
+	mv build/lock/constraints.txt constraints.txt
 
 SPHINX := $(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet
 
