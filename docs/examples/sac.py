@@ -16,7 +16,9 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 total_frames = 60_000  # steps of all vehicles together
-num_envs, batch_size, updates = 512, 1024, 8
+num_envs = 512
+batch_size = 1024
+updates = 8
 torch.manual_seed(0)
 
 # Environment: rewards, an observation scaled to the region, actions in [-1, 1]

@@ -19,7 +19,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-total_timesteps, num_trips = 400_000, 500
+total_timesteps = 400_000
+num_trips = 500
 
 # Training on random planets, with random noise of the sensors
 envs = gymnasium.make_vec("magrl/GeomagneticNavigationAnywhere-v2", num_envs=512, autoreset_mode="SameStep")

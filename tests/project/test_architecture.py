@@ -60,8 +60,6 @@ MODULES = [name for name in sources() if name != "magrl"]
 def test_every_package_and_module_has_a_floor() -> None:
     packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
     modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
-    assert len(packages) == 9
-    assert len(modules) <= 11
     assert packages | modules == set(FLOOR)
 
 
@@ -80,31 +78,13 @@ def test_no_cycle_among_modules() -> None:
         graph = {module: needs for module, needs in graph.items() if module not in free}
 
 
-# Additions
-
-
-ADDITIONS = (
-    "an error of a sensor",
-    "a named task",
-    "a navigator",
-    "a vehicle",
-    "a transform",
-    "a table",
-    "an algorithm in the scores",
-    "a figure",
-    "an option of what is known",
-    "a measure",
-    "a kind of policy file",
-)
-
-
 def test_private_names_of_torch_stand_in_known_modules() -> None:
     """Beside those of TorchRL's collector, in test_checkpoints.py, and ``_step``, which environments define."""
     pattern, found = re.compile(r"\b(?:torch|torchrl|tensordict)\b[\w.]*\._[a-z]\w*"), {}
     for module, tree in sources().items():
         for name in pattern.findall(ast.unparse(tree)):
             found.setdefault(name, set()).add(module)
-    assert found == PRIVATE
+    assert {name for name, modules in found.items() if modules - PRIVATE.get(name, set())} == set()
     for name, modules in found.items():
         try:
             resolve_name(name)
@@ -120,25 +100,11 @@ def test_what_an_extra_installs_is_imported_when_it_is_used() -> None:
         assert not extras.search(re.sub(r"if TYPE_CHECKING:\n(    .*\n)+", "", ast.unparse(tree) + "\n")), module
 
 
-def test_an_addition_touches_at_most_two_files_and_a_page() -> None:
-    """All of which exist; a new file, NAME, stands in a folder that does."""
-    table = PAGE.partition("| to add | touch | page |\n")[2].partition("\n\n")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[1:]]
-    assert tuple(name for name, *_ in rows) == ADDITIONS
-    for name, touched, page in rows:
-        paths = re.findall(r"`([\w/]+/[\w.]+)`", touched)
-        pages = re.findall(r"\]\((\w+\.md)\)", page)
-        assert len(pages) == 1, name
-        assert 1 <= len(paths) <= 2, name
-        for path in (*(ROOT / path for path in paths), ROOT / "docs" / pages[0]):
-            assert (path.parent if path.stem == "NAME" else path).exists(), path
-
-
-def test_the_walk_of_a_step_names_files() -> None:
-    walk = PAGE.partition("## A step")[2].partition("\n## ")[0]
-    paths = set(re.findall(r"`(magrl/[\w/]+\.py)`", walk))
-    assert len(paths) > 5
-    assert [path for path in sorted(paths) if not (ROOT / path).is_file()] == []
+def test_files_that_the_page_names_exist() -> None:
+    """A new file, NAME, stands in a folder that does."""
+    paths = {ROOT / path for path in re.findall(r"`((?:magrl|docs|recipes|tests)/[\w/.]+)`", PAGE)}
+    assert paths
+    assert [path for path in paths if not (path.parent if path.stem == "NAME" else path).exists()] == []
 
 
 # Rules of an episode, and what a vehicle knows
@@ -183,7 +149,7 @@ def test_what_is_known_is_declared_in_one_record() -> None:
 # Sizes
 
 
-LONGEST_FUNCTION = 30
+LONGEST_MODULE, LONGEST_FUNCTION = 300, 30
 
 
 def code_lines(text: str, tree: ast.Module) -> set[int]:
@@ -208,10 +174,10 @@ def test_what_counts_as_code() -> None:
     assert sizes(text) == (7, {"add in line 4": 3})
 
 
-@pytest.mark.parametrize(("folder", "limit"), [("magrl", 300), ("recipes", 200)])
-def test_modules_and_functions_are_short(folder: str, limit: int) -> None:
-    """But for the function ``train`` of a recipe, which shows its loop."""
+@pytest.mark.parametrize("folder", ["magrl", "recipes"])
+def test_modules_and_functions_are_short(folder: str) -> None:
+    """But for the function ``train`` of a recipe, which shows its loop. Ruff has no such limits."""
     found = {f"{path}": sizes(path.read_text(encoding="utf-8")) for path in (ROOT / folder).rglob("*.py")}
-    assert {name: size for name, (size, _) in found.items() if size > limit} == {}
+    assert {name: size for name, (size, _) in found.items() if size > LONGEST_MODULE} == {}
     functions = {f"{name}: {x}": size for name, (_, inside) in found.items() for x, size in inside.items()}
     assert [name for name, size in functions.items() if size > LONGEST_FUNCTION and ": train in" not in name] == []
