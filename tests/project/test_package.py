@@ -92,9 +92,10 @@ def python(wheel: Path, tmp_path_factory) -> Path:
 
 
 def files_of(*folders: str) -> set[str]:
-    """Return the files in some folders of this tree, by their path in it."""
-    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
-    return {str(path.relative_to(ROOT)) for path in files if path.suffix != ".pyc"}
+    """Return the files in some folders of this tree, by their path in it, without those that runs and tools leave."""
+    files = [path.relative_to(ROOT) for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    left = re.compile(r"(^|/)(\.|__pycache__/|runs/|wandb/)")
+    return {str(path) for path in files if not left.search(str(path))}
 
 
 def test_wheel_holds_the_library_its_licenses_and_nothing_else(wheel: Path) -> None:
