@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bars import BARS, flown
-from magrl.envs import Region, planet_scenario
+from magrl.envs import Region
 from magrl.errors import SensorErrors
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
+from magrl.field import SphericalHarmonicField, random_planets
 from magrl.field.weather import weather_record
 from magrl.files import write_text
 from magrl.named_tasks import NAMED_TASKS, storm_errors
@@ -51,7 +52,7 @@ LADDERS = (
 REGIONS = {
     "the task's region": {},
     "Azores": {"region": Region((35, 45), (-35, -25))},
-    "a random planet": {"scenario": planet_scenario(1, seed=1, distance_range_km=(300.0, 500.0))},
+    "a random planet": {"field": SphericalHarmonicField(random_planets(1, seed=1)[0])},
 }
 """Regions of agents of one region, by their columns."""
 TRAINED = (("box", "box-TD3"), ("box", "box-GG-TD3"), ("nogo", "nogo-TD3"), ("eddies", "eddies-TD3"))
