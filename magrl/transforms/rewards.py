@@ -109,7 +109,7 @@ class SPLReward(StepReward):
     """Write 10 times the change of what is earned of the SPL (:class:`HighestSPL`). Privileged.
 
     The rewards of an episode add up to 10 times its SPL if it arrives, and to less than 5 if it fails. They are changes
-    of a potential, so that legs there and back earn nothing. It replaces the reward of the environment.
+    of a potential of place and path. It replaces the reward of the environment.
 
     Args:
         in_keys: what is earned ``(..., 1)``; and the price of a step ``(..., 1)`` [% of SPL], which may be left out.
