@@ -87,8 +87,10 @@ class Features(BaseFeaturesExtractor):
 def make_model(config: Config) -> BaseAlgorithm:
     """Return an agent."""
     vehicles = GeomagneticNavVectorEnv(config.num_envs, task=config.task, autoreset_mode="SameStep")
-    options = {"features_extractor_class": Features, "features_extractor_kwargs": {"view": vehicles.torchrl_env.view}}
-    envs, first = BatchedVecEnv(vehicles), options if config.geometry else {}
+    envs, first = BatchedVecEnv(vehicles), dict[str, Any]()
+    if config.geometry:
+        first["features_extractor_class"] = Features
+        first["features_extractor_kwargs"] = {"view": vehicles.torchrl_env.view}
     settings: dict[str, Any] = {name: getattr(config, name) for name in ("learning_rate", "gamma", "seed")}
     settings["device"] = "cpu"
     if config.algorithm == "ppo":
