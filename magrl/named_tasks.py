@@ -87,7 +87,7 @@ def task_name(task: str) -> str:
     return name
 
 
-@named_task("Box", version=1, threshold=16.7)
+@named_task("Box", version=1, threshold=9.98)
 def box_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """Return the environment of the paper's task.
 
@@ -104,7 +104,7 @@ def box_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     return navigation_env(num_envs, **options)
 
 
-@named_task("Anywhere", version=2, threshold=16.1)
+@named_task("Anywhere", version=2, threshold=9.52)
 def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **options: Any) -> TransformedEnv:
     """Return the environment of an agent without a map: random planets, sensors and headings.
 
@@ -141,7 +141,7 @@ def _planets() -> Scenario:
     return planet_scenario(PLANET_REGIONS, seed=0, max_latitude=70.0, distance_range_km=(300.0, 500.0))
 
 
-@named_task("Readings", version=2, threshold=16.1)
+@named_task("Readings", version=2, threshold=9.52)
 def readings_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """Return the environment *Anywhere* without estimates: the agent observes raw readings and needs a memory.
 
@@ -156,7 +156,7 @@ def readings_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     return anywhere_env(num_envs, **{"observation": "readings"} | options)
 
 
-@named_task("Storm", version=2, threshold=15.2)
+@named_task("Storm", version=2, threshold=8.61)
 def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """Return the environment *Readings* with errors that no data sheet states, in an aircraft (:func:`storm_errors`).
 
@@ -197,7 +197,7 @@ def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = Fals
     return storm.replace_errors(**errors).transforms()
 
 
-@named_task("NoGo", version=1, threshold=16.5)
+@named_task("NoGo", version=1, threshold=9.82)
 def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> TransformedEnv:
     """Return the environment *Box* with no-go areas between start and destination, and a deadline of 20 steps.
 
@@ -239,7 +239,7 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
     return env
 
 
-@named_task("Eddies", version=1, threshold=15.4)
+@named_task("Eddies", version=1, threshold=9.7)
 def eddies_env(num_envs: int = 1, *, eddies_km_h: float = EDDY_MOTION["eddies_km_h"], **options: Any) -> TransformedEnv:
     """Return the environment *Box* of an underwater glider at 1 km/h, in eddies that are about as fast.
 

@@ -39,7 +39,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-VEHICLES, FEWER = 1000, {"estimated": 200}
+VEHICLES, FEWER = 1000, {"estimated": 200, "mapped": 200}
 STEP_PRICE, STORM_PRICE = 0.05, 0.1
 """Price of a step [% of SPL] of kalman and anywhere, where the score has none, chosen among .02, .05, .1, .2 and .5; in
 a storm, more steps find less."""
