@@ -31,7 +31,7 @@ from magrl.navigators.names import make_navigator
 from magrl.navigators.quasi_newton import last_leg
 from magrl.training import command
 from magrl.transforms.areas import CLEAR_KM, RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, shielded, turned
-from magrl.transforms.track import track_of
+from magrl.transforms.track import READ_KEYS, track_of
 
 import torch
 import tyro
@@ -128,7 +128,7 @@ class Around(Kalman):
     98.26, and the least turn of the secant's legs around the areas in sight 96.05.
     """
 
-    in_keys: ClassVar[list[str]] = [*Kalman.in_keys, "areas"]
+    in_keys: ClassVar[list[str]] = [*READ_KEYS, "track", "areas"]
 
     def transforms(self, env: EnvBase, **rules: Any) -> list[Transform]:
         return [*super().transforms(env, **rules), *Navigator.transforms(self, env, **rules)]

@@ -75,5 +75,5 @@ def test_every_pretrained_pilot_is_small_and_has_a_card() -> None:
         assert file.stat().st_size < 1_000_000
         card = file.with_suffix(".md").read_text(encoding="utf-8")
         assert all(f"## {part}\n" in card for part in ("Training", "Data", "Limits"))
-    with pytest.raises(ValueError, match=r"pretrained_policy must be one of .anywhere., .*, got .nowhere."):
+    with pytest.raises(ValueError, match=r"pretrained_policy must be one of .*'anywhere', .*, got 'nowhere'"):
         pretrained("nowhere")
