@@ -37,6 +37,7 @@ import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from pandas import DataFrame, Series, concat, read_csv
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
@@ -210,7 +211,7 @@ def figure(curves: DataFrame, episodes: DataFrame) -> Figure:
     """
     level = episodes.groupby(RUN[:2])["score"].mean()
     tasks = [task for task in NAMED_TASKS if task in set(curves["task"])]
-    drawn = Figure(figsize=(12, 3.6 * math.ceil(len(tasks) / 2)), layout="constrained")
+    drawn = Figure(figsize=(12, 4 * math.ceil(len(tasks) / 2)), layout="constrained")
     for part, task in zip(drawn.subfigures(math.ceil(len(tasks) / 2), 2, squeeze=False).flat, tasks, strict=False):
         both = part.subplots(1, 2, sharey=True)
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
@@ -224,9 +225,10 @@ def figure(curves: DataFrame, episodes: DataFrame) -> Figure:
                 axes.axhline(level[task, name], **look)
         for axes, text in zip(both, ("steps", "CPU time [min]"), strict=True):
             axes.set(xscale="log", xlabel=text, ylim=(0, 102))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         both[0].set_ylabel("score [%]")
         part.suptitle(task)
-        part.legend(*both[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
+        part.legend(*both[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
     return drawn
 
 
