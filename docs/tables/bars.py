@@ -47,7 +47,7 @@ BESIDE_KM, POINTS, FAR_KM = 1.0, 12, 1e4
 """Paths lead through so many corners around each no-go area, at this distance from it; and where none is."""
 COLUMNS = ("score", "SR", "SPL", "steps", "ms")
 BARS = {"secant": "secant", "kalman": "kalman, cheap steps", "anywhere": "anywhere (pretrained), cheap steps"}
-BARS |= {"memory": "memory (pretrained)"}
+BARS |= {"memory": "memory (trained on storm)", "readings-ppo_memory": "memory (trained on readings)"}
 BARS |= {"told": "kalman, cheap steps, which knows the size of each error"}
 BARS |= {"around": "shortest path around the areas seen so far, by kalman"}
 BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}

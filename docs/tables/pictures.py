@@ -246,7 +246,7 @@ def eddies_picture(episode: int = EDDY_EPISODE) -> Figure:
     shown = torch.cat([*paths, target[None]])
     arrows = draw_currents(axes, steps["motion_error"][0].double(), shown.amin(0) - 0.6, shown.amax(0) + 0.6)
     axes.quiverkey(arrows, 0.85, 1.04, 1.0, "1 km/h", labelpos="E")
-    axes.set_title("currents, which the vehicles do not know", loc="left", fontsize=10)
+    axes.set_title("currents, which the agent sees at its place alone", loc="left", fontsize=10)
     axes.plot(*paths[0][0].flip(0)[:, None], "s", color="black", ms=8, label="start")
     circle = displacement_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
     axes.plot(*circle.T.flip(0), color=TARGET, lw=2, label="destination, within 25 km")

@@ -1,7 +1,7 @@
 """Learning curves on the named tasks: algorithms of stable-baselines3, the recipes of this library, and your own.
 
     pip install -c constraints.txt -e '.[bench]'
-    python docs/tables/scores.py                                     # everything: about six hours on two cores
+    python docs/tables/scores.py                                     # everything: some hours on two cores
     python docs/tables/scores.py --tasks box --algorithms PPO --seeds 0
     python docs/tables/scores.py --tasks box --algorithms --command mine='python mine.py'    # as of recipes/sweep.py
     python docs/tables/scores.py --no-train                          # tables and figure of what is known
@@ -54,6 +54,7 @@ OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "
 COLORS = dict(zip(ALGORITHMS, OKABE_ITO, strict=False))
 """Colors of algorithms."""
 STYLES = {"secant": ":", "kalman": "--", "anywhere": "-.", "memory": (0, (1, 4)), "geodesic": "-", "told": (0, (8, 2))}
+STYLES |= {"readings-ppo_memory": (0, (1, 1))}
 STYLES |= {"around": (0, (5, 5)), "sighted": (0, (8, 2)), "detour": "-", "parallel": (0, (1, 4))}
 STYLES |= {"offset": (0, (5, 5)), "estimated": (0, (8, 2)), "mapped": (0, (3, 1, 1, 1, 1, 1))}
 """Lines of references, each with one style in all panels."""
