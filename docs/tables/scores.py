@@ -48,6 +48,8 @@ RUN = ["task", "algorithm", "seed"]
 MEASURES = {"eval_score": "score", "eval_success_rate": "SR", "eval_spl": "SPL"}
 """Measures [%], and their columns of learning curves."""
 COLUMNS = [*RUN, "steps", "cpu_s", "score", "SR", "SPL"]
+HEADS = ["task", "agent", "seeds × steps", "CPU", "score %", "less the best reference", "SR %", "SPL %", "steps"]
+"""Columns of the learning curves, and of the table."""
 DRAWS = 2000
 """Bootstrap samples of an interval."""
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -176,33 +178,32 @@ def table(points: DataFrame, episodes: DataFrame) -> str:
     """Return the Markdown table of scores, with references: interquartile means over seeds, intervals over both."""
     known, rows = dict(ends(points)), []
     for task, name in sorted(set(episodes[RUN[:2]].itertuples(index=False, name=None)), key=place_of(episodes)):
-        runs, last = episodes[(episodes["task"] == task) & (episodes["algorithm"] == name)], known.get((task, name))
-        about = ["—", "—"]
+        flights = episodes[episodes["task"] == task]
+        runs, last = flights[flights["algorithm"] == name], known.get((task, name))
+        about = ["—", "—", "—"]
         if last is not None:
-            about = [f"{len(last)} × {last['steps'].max() / 1000:.0f} k", f"{last['cpu_s'].median() / 60:.1f} min"]
+            steps = f"{len(last)} × {last['steps'].max() / 1000:.0f} k"
+            about = [steps, f"{last['cpu_s'].median() / 60:.1f} min", behind(flights, name)]
         means = middle(100 * cells(runs, "success")), middle(100 * cells(runs, "SPL")), middle(cells(runs, "steps"))
         label = name if last is not None else BARS[name]
-        rows.append([task, label, *about, spread(cells(runs, "score")), *(f"{mean:.1f}" for mean in means)])
-    return markdown_table(["task", "agent", "seeds × steps", "CPU", "score %", "SR %", "SPL %", "steps"], rows)
+        rows.append([task, label, *about[:2], spread(cells(runs, "score")), about[2], *(f"{x:.1f}" for x in means)])
+    return markdown_table(HEADS, rows)
+
+
+def behind(flights: DataFrame, name: str) -> str:
+    """Return the score of an agent less that of the strongest reference but oracles, episode by episode."""
+    scores = {one: cells(runs, "score") for one, runs in flights.groupby("algorithm", sort=False)}
+    rules = [rule for rule in scores if rule in BARS and "oracle" not in BARS[rule]]
+    if not rules:
+        return "—"
+    best = scores[max(rules, key=lambda rule: scores[rule].mean())]
+    return spread(scores[name][:, : best.shape[1]] - best, "+.1f")
 
 
 def place_of(episodes: DataFrame) -> Callable[[tuple[str, str]], tuple[int, int]]:
     """Return the order of the rows of a table: tasks, in them algorithms, then references."""
     names = [*ALGORITHMS, *(name for name in episodes["algorithm"].unique() if name not in BARS), *BARS]
     return lambda pair: (list(NAMED_TASKS).index(pair[0]), names.index(pair[1]))
-
-
-def against(episodes: DataFrame) -> str:
-    """Return the Markdown table of agents against the strongest reference but oracles, episode by episode."""
-    rows = []
-    for task, flights in episodes.groupby("task", sort=False):
-        by_name = {name: cells(runs, "score") for name, runs in flights.groupby("algorithm", sort=False)}
-        rules = [name for name in by_name if name in BARS and "oracle" not in BARS[name]]
-        for name in [name for name in by_name if rules and name not in BARS]:
-            best = max(rules, key=lambda rule: by_name[rule].mean())
-            difference = by_name[name][:, : by_name[best].shape[1]] - by_name[best]
-            rows.append([task, name, BARS[best], spread(difference, "+.1f")])
-    return markdown_table(["task", "agent", "strongest reference", "score of the agent less its"], rows)
 
 
 def figure(curves: DataFrame, episodes: DataFrame) -> Figure:
@@ -247,7 +248,6 @@ def main(args: Sequence[str] | None = None) -> None:
         check_choice(ALGORITHMS, algorithm=name)
     points, episodes = results(config)
     write_text(config.results / "scores.md", table(points, episodes))
-    write_text(config.results / "against.md", against(episodes))
     runs = episodes[~episodes["algorithm"].isin(BARS)].groupby(RUN, sort=False)["score"].mean().reset_index()
     keep_agents(runs.groupby(RUN[:2], sort=False), config.out, config.agents)
     write_picture(config.results / "scores.png", figure(points, episodes), config.results / "scores.csv", dpi=130)
