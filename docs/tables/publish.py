@@ -4,7 +4,8 @@
 
 A document marks the place and the file of a table by `<!-- table: docs/results/NAME.md -->` and `<!-- end -->`. Names
 of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator | SPL % -->`, leave out the others. With
-conditions, as in `| navigator = secant or Kalman |`, rows with another cell in that column are left out.
+conditions, as in `| navigator = secant or Kalman |`, rows with another cell in that column are left out; a column with
+a single condition is not shown. Values have no-break spaces.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from magrl.training import UsageError, command
 
 import tyro
 
+SPACE = re.compile(r"(?<=\d) (?=[±(/])|(?<=±) |(?<=\d) (?=to )|(?<=\d to) ")
 BLOCK = re.compile(r"(<!-- table: ([^\s|]+)(?: \| (.*?))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -28,12 +30,12 @@ def selected(table: str, columns: str | None) -> str:
     Raises:
         UsageError: for a heading or a cell that the table lacks.
     """
+    table = SPACE.sub("\N{NO-BREAK SPACE}", table)
     if columns is None:
         return table
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-    heads, _, cells = zip(
-        *([part.strip() for part in column.partition("=")] for column in columns.split("|")), strict=True
-    )
+    columns = SPACE.sub("\N{NO-BREAK SPACE}", columns)
+    heads, _, cells = zip(*([part.strip() for part in one.partition("=")] for one in columns.split("|")), strict=True)
     if missing := [head for head in heads if head not in rows[0]]:
         raise UsageError(f"the table has no column {', '.join(missing)}: choose from {', '.join(rows[0])}")
     places = [rows[0].index(head) for head in heads]
@@ -43,7 +45,8 @@ def selected(table: str, columns: str | None) -> str:
     ]:
         raise UsageError(f"the table has no row {', '.join(missing)}")
     body = [row for row in rows[2:] if all(row[place] in wanted for place, wanted in kept.items())]
-    return markdown_table(list(heads), [[row[place] for place in places] for row in body])
+    shown = [place for place in places if len(kept.get(place, "two")) > 1]
+    return markdown_table([rows[0][place] for place in shown], [[row[place] for place in shown] for row in body])
 
 
 def publish(documents: Sequence[Path], root: Path = Path()) -> None:

@@ -233,7 +233,7 @@ def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() ->
         name, *shown = (cell.strip() for cell in line.strip("|").split("|")[:5])
         assert name.startswith(measured[0])
         pairs = zip(measured[1:], published[1:], strict=True)
-        assert shown == [f"{here.partition(' ')[0]} / {there}" for here, there in pairs]
+        assert shown == [f"{here.split()[0]} / {there}" for here, there in pairs]
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("docs/results/[!s]*.csv.gz")), ids=lambda path: path.name)

@@ -75,6 +75,12 @@ def test_a_document_may_show_some_columns_and_rows() -> None:
     table = "| name | SPL % |\n|---|---|\n| secant | 99.0 |\n| kalman | 98.0 |\n| geodesic | 100.0 |"
     shown = publish.selected(table, "SPL % | name = kalman or geodesic").splitlines()
     assert shown == ["| SPL % | name |", "|---|---|", "| 98.0 | kalman |", "| 100.0 | geodesic |"]
+    assert publish.selected(table, "name = kalman | SPL %").splitlines() == ["| SPL % |", "|---|", "| 98.0 |"]
+    ends = "| a |\n|---|\n| 9.0 ± 0.1 / 8.0 ± 0.1 |\n| +1.0 (-0.5 to +2.5) |"
+    assert publish.selected(ends, "a").splitlines()[2:] == [
+        "| 9.0\xa0±\xa00.1\xa0/ 8.0\xa0±\xa00.1 |",
+        "| +1.0\xa0(-0.5\xa0to\xa0+2.5) |",
+    ]
     for columns, message in (("SR %", "no column SR %: choose from name, SPL %"), ("name = mars or x", "no row mars")):
         with pytest.raises(UsageError, match=message):
             publish.selected(table, columns)
