@@ -92,7 +92,8 @@ class Report:
         _, heading, others = page.read_text(encoding="utf-8").partition("\n## ")  # tables of other measurements
         page.write_text(f"{table(self.rows)}\n{self.summary()}{heading}{others}", encoding="utf-8")
         (results / "profile.md").write_text(shares_table(self.content["profile"]), encoding="utf-8")
-        cost_figure(self.content["vehicles"]).savefig(results / "cost-by-vehicles.png", dpi=110)
+        source = {"Source": "python -m benchmarks --publish"}
+        cost_figure(self.content["vehicles"]).savefig(results / "cost-by-vehicles.png", dpi=110, metadata=source)
 
 
 def main(args: list[str] | None = None) -> None:

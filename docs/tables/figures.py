@@ -144,13 +144,13 @@ def mean_spl(flights: Flights, navigator: str, errors: Conditions) -> tuple[floa
 
 def error_panels(data: DataFrame) -> Figure:
     """Return the panels of :func:`conditions`."""
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
-    *panels, last = figure.subplots(3, 4, sharey=True).flat
+    figure = Figure(figsize=(9, 10), layout="constrained")
+    *panels, last = figure.subplots(4, 3, sharey=True).flat
     for axes, (title, rows) in zip(panels, data.groupby("error", sort=False), strict=True):
         for navigator, points in rows.groupby("navigator", sort=False):
             axes.errorbar(points["size"], points["spl"], points["half_interval"], **look(navigator))
-        axes.tick_params("x", labelsize=7)
-        axes.set_xlabel(title, fontsize=9)
+        axes.tick_params("x", labelsize=8)
+        axes.set_xlabel(title)
         axes.grid(alpha=0.3)
     figure.supylabel("SPL [%]")
     last.axis("off")
@@ -163,20 +163,28 @@ def reliability_diagram(trips: int = 2000) -> Figures:
 
     One panel is for white noise, one for the errors of vehicles; bars are intervals of 95 %, clustered by region.
     """
-    figure, rows = Figure(figsize=(9, 4.6), layout="constrained"), []
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axes, names in zip(panels, ((), ("aircraft", "ship", "underwater", "low-cost")), strict=True):
+    rows = []
+    for names in ((), ("aircraft", "ship", "underwater", "low-cost")):
         flights = Flights(names, trips=trips, regions=min(trips, 512), max_steps=80, within_km=25.0)
-        axes.axline((0, 0), (100, 100), color="#808080", lw=1, ls="--")
-        for (name, errors), like in zip(flights.errors.items(), MARKERS, strict=False):
+        for name, errors in flights.errors.items():
             bins = reliability(flights.fly("anywhere", errors), flights.scenario.trips.region, 25.0)
-            axes.errorbar(*zip(*bins, strict=True), **look(like) | {"label": name})
             rows += [(name, *one) for one in bins]
-        axes.set_xlabel("stated probability [%]")
-        axes.legend(fontsize=8)
-    panels[0].set_ylabel("share of readings within 25 km [%]")
     data = DataFrame(rows, columns=["errors", "stated", "observed", "half_interval"]).round(1)
-    return {"results/reliability": data, "figures/reliability": figure}
+    return {"results/reliability": data, "figures/reliability": reliability_panels(data)}
+
+
+def reliability_panels(data: DataFrame) -> Figure:
+    """Return the panels of :func:`reliability_diagram`."""
+    figure, noise = Figure(figsize=(9, 4.6), layout="constrained"), data["errors"].str.contains(",")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, rows, title in zip(panels, (data[noise], data[~noise]), ("noise [°, °, nT]", "vehicle"), strict=True):
+        axes.axline((0, 0), (100, 100), color="#808080", lw=1, ls="--")
+        for (name, bins), like in zip(rows.groupby("errors", sort=False), MARKERS, strict=False):
+            axes.errorbar(bins["stated"], bins["observed"], bins["half_interval"], **look(like) | {"label": name})
+        axes.set_xlabel("stated probability [%]")
+        axes.legend(title=title)
+    panels[0].set_ylabel("share of readings within 25 km [%]")
+    return figure
 
 
 def place_error(trips: int = 64) -> Figures:
@@ -224,7 +232,7 @@ def two_elements() -> Figures:
     weight = torch.cos(torch.deg2rad(latitude)) * (latitude.abs() < 60)
     share = (weight @ (angle < 5).double().mean(-1)) / weight.sum()
     axes.set(xticklabels=[], yticklabels=[], title=f"below 5° at {100 * share:.0f} % of places between 60° S and 60° N")
-    figure.colorbar(filled, shrink=0.7, pad=0.02, label="angle between the gradients of I and B_H [°]")
+    figure.colorbar(filled, shrink=0.7, pad=0.02, label="angle between the gradients of I and $B_H$ [°]")
     return {"figures/two-elements": figure}
 
 
@@ -254,12 +262,13 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], trips: int | None = Non
     options = {"trips": trips} if trips else {}
     try:
         for name in figures:
+            source = f"python docs/tables/figures.py {name}" + (f" --trips {trips}" if trips else "")
             for file, made in FIGURES[name](**options).items():
                 if isinstance(made, DataFrame):
                     check_writable(out / f"{file}.csv")
                     write_with(out / f"{file}.csv", made.to_csv, index=False)
                 else:
-                    write_picture(out / f"{file}.png", made, out / DATA[file] if file in DATA else None)
+                    write_picture(out / f"{file}.png", made, source, out / DATA[file] if file in DATA else None)
                 print(out / file)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error

@@ -20,9 +20,13 @@ from magrl.geodesy import geodesic, move_place, polar
 from magrl.navigators.names import named
 from magrl.sensor_std import Noise
 
+import numpy as np
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pandas import DataFrame
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -37,6 +41,8 @@ PLACED = ("geodesic",)
 """Navigators that read no elements."""
 ABOUT = ("navigator", "trained on", "start", "map", "elements at the destination")
 """First columns of a table: what each navigator is, and what it knows."""
+COLORS = 256
+"""Most colors of a picture."""
 OWN_MODEL = "model"
 """``target_std`` in a file, where the elements of the destination are from the vehicle's own model."""
 
@@ -154,10 +160,29 @@ def digest(data: Path) -> str:
     return hashlib.sha256(data.read_bytes()).hexdigest()[:16]
 
 
-def write_picture(path: Path, figure: Figure, data: Path | None = None, dpi: int = 110) -> None:
-    """Write a figure; of one that is drawn from a file, the digest of that file is its description."""
+def image_of(figure: Figure) -> Image.Image:
+    """Return a figure as an image."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def write_picture(path: Path, figure: Figure, source: str, data: Path | None = None) -> None:
+    """Write a picture in at most 256 colors, with metadata that name its source and the data that it is drawn from.
+
+    Args:
+        path: file, which is replaced.
+        figure: picture.
+        source: command that draws it, and what it shows.
+        data: file that it is drawn from: its name and digest are the description of the picture.
+    """
     check_writable(path)
-    write_with(path, figure.savefig, dpi=dpi, metadata={"Description": digest(data)} if data else {})
+    metadata = PngInfo()
+    metadata.add_text("Source", source)
+    if data:
+        metadata.add_text("Description", f"{data.name} {digest(data)}")
+    image = image_of(figure).quantize(COLORS, Image.Quantize.MAXCOVERAGE, kmeans=1)  # others lose rare colors
+    write_with(path, image.save, "PNG", pnginfo=metadata, optimize=True)
 
 
 def matching(pattern: str) -> list[str]:

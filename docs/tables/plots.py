@@ -43,6 +43,8 @@ def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
 def learning_curves(data: DataFrame, column: str, label: str) -> Figure:
     """Return learning curves of several trainings of each navigator: single runs, their mean and their range.
 
+    The lowest 2 % of the values, those of first episodes, are below the figure: they would squeeze the others.
+
     Args:
         data: a row for each ``navigator``, ``run`` and number of ``episodes``.
         column: name of the values.
@@ -50,10 +52,10 @@ def learning_curves(data: DataFrame, column: str, label: str) -> Figure:
 
     Example:
         >>> data = DataFrame({"navigator": "td3", "run": [0, 1], "episodes": 50, "spl": [50.0, 70.0]})
-        >>> learning_curves(data, "spl", "SPL [%]").axes[0].get_legend().get_texts()[0].get_text()
+        >>> learning_curves(data, "spl", "SPL [%]").legends[0].get_texts()[0].get_text()
         'TD3, 2 seeds'
     """
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    figure = Figure(figsize=(8, 5.5), layout="constrained")
     axes = figure.subplots()
     for name, rows in data.groupby("navigator", sort=False):
         look = _look(str(name))
@@ -63,8 +65,9 @@ def learning_curves(data: DataFrame, column: str, label: str) -> Figure:
         text = f"{look['label']}, {runs.shape[1]} seed{'s' if runs.shape[1] > 1 else ''}"
         axes.plot(runs.mean(axis=1), color=look["color"], lw=2, label=text)
     axes.set(xlabel="episodes", ylabel=label)
+    axes.set_ylim(bottom=data[column].quantile(0.02))
     axes.grid(alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -127,7 +130,7 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
         if key in targets:
             axes.axhline(targets[key], color="#404040", ls="--", lw=1, label="at the destination")
         axes.set_xlabel("step")
-    figure.axes[0].legend(fontsize=8)
+    figure.axes[0].legend()
     return figure
 
 

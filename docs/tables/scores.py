@@ -20,6 +20,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from agents import keep_agents
 from bars import BARS, bars_of, flown
@@ -55,11 +56,10 @@ DRAWS = 2000
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 COLORS = dict(zip(ALGORITHMS, OKABE_ITO, strict=False))
 """Colors of algorithms."""
-STYLES = {"secant": ":", "kalman": "--", "anywhere": "-.", "memory": (0, (1, 4)), "geodesic": "-", "told": (0, (8, 2))}
-STYLES |= {"readings-ppo_memory": (0, (1, 1))}
-STYLES |= {"around": (0, (5, 5)), "sighted": (0, (8, 2)), "detour": "-", "parallel": (0, (1, 4))}
-STYLES |= {"offset": (0, (5, 5)), "estimated": (0, (8, 2)), "mapped": (0, (3, 1, 1, 1, 1, 1))}
-"""Lines of references, each with one style in all panels."""
+LEVELS = {"strongest reference": "--", "oracle": ":"}
+"""Levels in each panel, and their lines."""
+SOURCE = "python docs/tables/scores.py --no-train"
+"""Command that draws the figure."""
 
 
 @dataclass(frozen=True)
@@ -207,36 +207,43 @@ def place_of(episodes: DataFrame) -> Callable[[tuple[str, str]], tuple[int, int]
 
 
 def figure(curves: DataFrame, episodes: DataFrame) -> Figure:
-    """Return scores over steps and over CPU time: medians over seeds, bands from the least to the highest, and bars.
+    """Return scores over steps and over CPU time: medians over seeds, bands from the least to the highest, and the
+    levels of the strongest reference and of the oracle.
 
     The last point of a run, its score, is left out: it is of other episodes.
     """
-    level = episodes.groupby(RUN[:2])["score"].mean()
+    points = curves.assign(cpu=cpu_minutes(curves))
+    points = points[points.duplicated(RUN, keep="last")]
     tasks = [task for task in NAMED_TASKS if task in set(curves["task"])]
-    drawn = Figure(figsize=(12, 4 * math.ceil(len(tasks) / 2)), layout="constrained")
-    for part, task in zip(drawn.subfigures(math.ceil(len(tasks) / 2), 2, squeeze=False).flat, tasks, strict=False):
+    drawn = Figure(figsize=(9, 3.3 * math.ceil(len(tasks) / 2) + 0.6), dpi=130, layout="constrained")
+    parts = drawn.subfigures(math.ceil(len(tasks) / 2), 2, squeeze=False, wspace=0.02)
+    labels: dict[str, Any] = {}
+    for part, task in zip(parts.flat, tasks, strict=False):
         both = part.subplots(1, 2, sharey=True)
-        for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
-            points = runs.assign(cpu=cpu_minutes(runs))
-            points = points[points.duplicated("seed", keep="last")]
-            for axes, along in zip(both, ("steps", "cpu"), strict=True):
-                draw_seeds(axes, points, along, "score", color=COLORS.get(name, "black"), label=name)
-        for name in bars_of(task)[::-1]:  # oracle first
-            look = {"color": "gray", "ls": STYLES[name], "lw": 1, "label": BARS[name].partition(" (")[0]}
-            for axes in both:
-                axes.axhline(level[task, name], **look)
-        for axes, text in zip(both, ("steps", "CPU time [min]"), strict=True):
-            axes.set(xscale="log", xlabel=text, ylim=(0, 102))
+        part.suptitle(task, fontsize=11)
+        for axes, (along, text) in zip(both, (("steps", "steps"), ("cpu", "CPU time [min]")), strict=True):
+            for name, runs in points[points["task"] == task].groupby("algorithm", sort=False):
+                draw_seeds(axes, runs, along, "score", color=COLORS.get(name, "black"), label=name)
+            for (label, style), level in zip(LEVELS.items(), levels(task, episodes), strict=True):
+                axes.axhline(level, color="gray", ls=style, lw=1.5, label=label)
+            axes.set(xscale="log", xlabel=text, xlim=(points[along].min(), 1.3 * points[along].max()), ylim=(0, 102))
             axes.xaxis.set_minor_formatter(NullFormatter())
         both[0].set_ylabel("score [%]")
-        part.suptitle(task)
-        part.legend(*both[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
+        handles, names = both[0].get_legend_handles_labels()
+        labels |= dict(zip(names, handles, strict=True))
+    drawn.legend(labels.values(), labels, fontsize=9, loc="outside lower center", ncols=4)
     return drawn
+
+
+def levels(task: str, episodes: DataFrame) -> tuple[float, float]:
+    """Return the scores of the strongest reference but oracles, and of the oracle."""
+    score, bars = episodes[episodes["task"] == task].groupby("algorithm")["score"].mean(), bars_of(task)
+    return score[[name for name in bars if "oracle" not in BARS[name]]].max(), score[bars[-1:]].max()
 
 
 def cpu_minutes(runs: DataFrame) -> Series:
     """Return the CPU time of each point [min]; of a recipe, which states the whole, in proportion to its steps."""
-    last = runs.groupby("seed")[["steps", "cpu_s"]].transform("last")
+    last = runs.groupby(RUN)[["steps", "cpu_s"]].transform("last")
     return (runs["cpu_s"].fillna(last["cpu_s"] * runs["steps"] / last["steps"]) / 60).clip(lower=0.01)
 
 
@@ -250,7 +257,7 @@ def main(args: Sequence[str] | None = None) -> None:
     write_text(config.results / "scores.md", table(points, episodes))
     runs = episodes[~episodes["algorithm"].isin(BARS)].groupby(RUN, sort=False)["score"].mean().reset_index()
     keep_agents(runs.groupby(RUN[:2], sort=False), config.out, config.agents)
-    write_picture(config.results / "scores.png", figure(points, episodes), config.results / "scores.csv", dpi=130)
+    write_picture(config.results / "scores.png", figure(points, episodes), SOURCE, config.results / "scores.csv")
 
 
 if __name__ == "__main__":

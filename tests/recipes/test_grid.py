@@ -292,7 +292,8 @@ def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) ->
         assert [line.get_ydata()[-1] for line in means] == last
     figures.draw(("learning",), out=tmp_path)
     with Image.open(tmp_path / "results" / "fig-6-return.png") as picture:
-        assert picture.info["Description"] == flights.digest(tmp_path / "results" / "learning.csv")
+        assert picture.info["Source"] == "python docs/tables/figures.py learning"
+        assert picture.info["Description"] == f"learning.csv {flights.digest(tmp_path / 'results' / 'learning.csv')}"
 
 
 def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeypatch) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import figures
 import flights
 import numpy as np
@@ -15,17 +18,16 @@ from magrl.transforms.areas import NUMBER
 
 DOCS = ROOT / "docs"
 DRAWN = figures.DATA | {"results/scores": "results/scores.csv"}
-OTHERS = {"fig-5-contours", "two-elements"}  # of the field alone
-OTHERS |= {"eddies", *(f"task-{task}" for task in pictures.NAMED_TASKS)}  # flights
-OTHERS |= {"plume", "cost-by-vehicles"}  # a training, a benchmark
 
 
-@pytest.mark.parametrize("path", sorted(DOCS.glob("*/*.png")), ids=lambda path: path.stem)
-def test_pictures_show_the_published_data(path) -> None:
-    data = DRAWN.get(f"{path.parent.name}/{path.stem}")
-    assert (data is None) == (path.stem in OTHERS)
+@pytest.mark.parametrize("path", sorted(DOCS.glob("*/[!et]*.png")), ids=lambda path: path.stem)
+def test_pictures_name_their_source_and_show_the_published_data(path) -> None:
     with Image.open(path) as picture:
-        assert picture.info.get("Description") == (flights.digest(DOCS / data) if data else None)
+        source, about = picture.info["Source"], picture.info.get("Description")
+    (script,) = re.findall(r"docs/tables/\w+\.py|-m benchmarks", source)
+    assert (ROOT / script.removeprefix("-m ")).exists()
+    data = DRAWN.get(f"{path.parent.name}/{path.stem}")
+    assert about == (f"{Path(data).name} {flights.digest(DOCS / data)}" if data else None)
 
 
 def voyage(*believed: float) -> pictures.Voyage:

@@ -114,6 +114,19 @@ def test_known_results_are_drawn_without_training(tmp_path: Path, monkeypatch) -
     assert (tmp_path / "scores.png").exists()
 
 
+def test_a_panel_has_the_curves_of_a_task_and_two_levels() -> None:
+    """The CPU time of a run that states it at its end is in proportion to its steps."""
+    rows = [[name, steps, cpu, 10.0 * steps] for name, last in (("TD3", 120.0), ("PPO", 600.0))
+            for steps, cpu in ((1, None), (2, None), (4, last))]  # fmt: skip
+    curves = DataFrame(rows, columns=["algorithm", "steps", "cpu_s", "score"]).assign(task="eddies", seed=0)
+    flights = read_csv(RESULTS / "scores.csv.gz")
+    steps, cpu = scores.figure(curves, flights).subfigs[0].axes
+    assert [line.get_xydata().tolist() for line in steps.lines[:2]] == [[[1, 10], [2, 20]]] * 2
+    assert [line.get_xdata().tolist() for line in cpu.lines[:2]] == [[0.5, 1.0], [2.5, 5.0]]
+    means = flights[flights["task"] == "eddies"].groupby("algorithm")["score"].mean()
+    assert [line.get_ydata()[0] for line in cpu.lines[2:]] == [means["estimated"], means["mapped"]]
+
+
 def test_a_sweep_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for results, options, message in (
