@@ -22,8 +22,8 @@ from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.maps import LAND, coastlines, displacement_ellipse
+from magrl.evaluation.scores import SEED
 from magrl.field import IGRF, FieldModel
-from magrl.field.elements import UNITS
 from magrl.files import read_text, write_with
 from magrl.geodesy import geodesic
 from magrl.named_tasks import EDDY_MOTION, NAMED_TASKS
@@ -34,29 +34,30 @@ import numpy as np
 import torch
 import tyro
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 sys.path.insert(0, str(Path(__file__).parent))
 from bars import TASKS, flown
-from flights import Flights, believed_places
+from flights import COLORS, Flights, believed_places, image_of, write_picture
 
 SHOWN, WITHIN_KM = 212, 25.0
 """Trip of the animation, chosen in the open sea with a coast in sight, and the radius of arrival."""
 FIELD = IGRF("2025-01-01")
 GRAY, BLUE, VERMILION = "#707070", "#0072B2", "#D55E00"
-KM_PER_DEG, ROOM_KM = 111.2, 30.0
+KM_PER_DEG = 111.2
 COUNTER = ((0.63, "black"), (0.65, GRAY), (0.795, "black"), (0.825, BLUE))
 """Place and color of each part of the counter."""
-PIECE_KM, FRAME_MS, LAST_MS, SCALE_KM = 30.0, 120, 3000, 200.0
-"""Longest distance between two frames, their durations, and the scale bar [km]."""
-COLORS, VEHICLES, EDDY_EPISODE = 256, 16, 4
-"""Colors of a map, vehicles of a rollout, episode of *Eddies*, in which the true bearing fails."""
+PIECE_KM, FRAME_MS, LAST_MS = 30.0, 120, 3000
+"""Longest distance between two frames, and their durations."""
+VEHICLES, ROOM_KM = 16, {"box": 0.0, "anywhere": 400.0}
+"""Vehicles of a rollout, and room around an episode: none shows its whole region."""
+COMMAND = "python docs/tables/pictures.py"
 
 
 class Voyage(NamedTuple):
@@ -75,7 +76,7 @@ class Voyage(NamedTuple):
     @classmethod
     def of(cls, steps: TensorDictBase, belief: str) -> Voyage:
         """Return the voyage of an episode ``(T,)`` by one of :func:`believed_places`."""
-        steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
+        steps = first_episode(steps)
         places = believed_places(steps["next"][None])[belief][0]
         key = "track", "displacement", "covariance"
         pairs = ("position", steps["next", "position"]), ("start_place", places), (key, steps["next", *key])
@@ -117,8 +118,10 @@ class Animation:
         self.target, self.voyages = target, (reckoning, filtered)
         self.figure = Figure(figsize=(7.2, 7.4), dpi=100)
         axes = self.figure.add_axes((0.01, 0.13, 0.98, 0.79))
-        draw_map(axes, FIELD, torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None])))
-        draw_scale(axes)
+        shown = torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None]))
+        draw_map(axes, FIELD, box_around(axes, shown), alpha=0.4)
+        axes.plot(*coastlines().T[::-1], color=LAND, lw=2.5)
+        draw_scale(axes, 200.0)
         circle = displacement_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
         axes.plot(*circle.T.flip(0), color=TARGET, lw=2.5)
         axes.plot(*target.flip(-1)[:, None], "^", color=TARGET, ms=8, zorder=3)
@@ -164,117 +167,131 @@ class Animation:
         yield self.image(step + 1, verdict)
 
 
-def image_of(figure: Figure) -> Image.Image:
-    """Return a figure as an image."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-
-
 def apart_km(one: Tensor, other: Tensor) -> float:
     """Return the distance of two places ``(2,)`` [km]."""
     return geodesic(*one, *other)[0].item()
 
 
-def draw_map(axes: Axes, field: FieldModel, places: Tensor, *, coast: bool = True) -> None:
-    """Draw contours of a field and coastlines around places ``(P, 2)`` [deg], without any text."""
+def box_around(axes: Axes, places: Tensor, room_km: float = 30.0) -> Region:
+    """Return the box of a map that shows places ``(P, 2)`` [deg] with room around them, and fills the axes."""
     low, high = places.amin(0), places.amax(0)
     narrow, width, height = math.cos(math.radians((low + high)[0] / 2)), *axes.bbox.size
-    north, east = (high - low) * torch.tensor([1, narrow]) / 2 + ROOM_KM / KM_PER_DEG
+    north, east = (high - low) * torch.tensor([1, narrow]) / 2 + room_km / KM_PER_DEG
     half = max(north, east * height / width)
     half = torch.stack((half, half * width / height / narrow))
-    box = Region(*torch.stack(((low + high) / 2 - half, (low + high) / 2 + half), -1).tolist())
+    return Region(*torch.stack(((low + high) / 2 - half, (low + high) / 2 + half), -1).tolist())
+
+
+def draw_map(axes: Axes, field: FieldModel, box: Region, **look: float) -> None:
+    """Draw contours of a field in a box, without any text."""
     for lines in contour_lines(axes, field, box).values():
-        lines.set_alpha(0.4)
-    if coast:
-        axes.plot(*coastlines().T[::-1], color=LAND, lw=2.5)
+        lines.set(**look)
     axes.set(xlim=box.longitude, ylim=box.latitude, xticks=[], yticks=[])
 
 
-def draw_scale(axes: Axes) -> None:
-    """Draw a scale bar and the direction of north in a corner of a map."""
+def draw_scale(axes: Axes, length_km: float) -> None:
+    """Draw a scale bar and the direction of north in the corners of a map."""
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
     here = south + 0.04 * (north - south)
-    bar = SCALE_KM / KM_PER_DEG / math.cos(math.radians(here))
+    bar = length_km / KM_PER_DEG / math.cos(math.radians(here))
     left = east - 0.04 * (east - west) - bar
-    axes.plot([left, left + bar], [here, here], color="black", lw=4)
-    axes.text(left + bar / 2, here + 0.012 * (north - south), f"{SCALE_KM:.0f} km", fontsize=17, ha="center")
+    axes.plot([left, left + bar], [here, here], color="black", lw=4, zorder=4)
+    look = {"fontsize": 17, "ha": "center", "backgroundcolor": "white"}
+    axes.text(left + bar / 2, here + 0.012 * (north - south), f"{length_km:.0f} km", **look)
     arrow = {"arrowstyle": "<-", "lw": 2.5}
     axes.annotate("N", (0.06, 0.82), (0.06, 0.94), "axes fraction", arrowprops=arrow, fontsize=19, ha="center")
 
 
+def first_episode(steps: TensorDictBase) -> TensorDictBase:
+    """Return the steps of a vehicle ``(T,)`` to the end of its first episode."""
+    return steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
+
+
 def task_picture(task: str) -> Figure:
-    """Return a map of an episode, or on *Storm* the errors of its readings."""
-    navigator, episode = TASKS[task].picture
+    """Return what sets a task apart: its region, fields of four planets, readings, their errors, areas or currents."""
+    navigator, number = TASKS[task].picture
     env, rollout = flown(task, navigator, VEHICLES)
-    steps = rollout[episode]
-    steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
     figure = Figure(figsize=(3, 3), dpi=100)
-    if task == "storm":
-        draw_errors(figure, steps["field"] - steps["true_field"])
+    if task in ("readings", "storm"):
+        steps = first_episode(rollout[number])["next"]
+        draw_readings(figure, steps["field"] - steps["target_field" if task == "readings" else "true_field"])
         return figure
-    axes, index = figure.add_axes((0.01, 0.01, 0.98, 0.98)), steps["region"][0, 0]
-    field = partial(env.field, index=index) if len(env.region) > 1 else env.field
-    path = env.region[index].unwrapped(torch.cat((steps["position"][:1], steps["next", "position"])).double())
-    target = env.region[index].unwrapped(steps["target_position"][:1].double())
-    areas = steps.get("no_go_areas", None)
+    side = 2 if task == "anywhere" else 1
+    figure.subplots_adjust(0.01, 0.01, 0.99, 0.99, 0.04, 0.04)
+    for episode, axes in enumerate(figure.subplots(side, side, squeeze=False).flat, number):
+        draw_episode(axes, env, first_episode(rollout[episode]), ROOM_KM.get(task, 30.0))
+    return figure
+
+
+def draw_episode(axes: Axes, env: EnvBase, steps: TensorDictBase, room_km: float) -> None:
+    """Draw an episode ``(T,)`` over contours of its field or over its currents; without room, in its whole region."""
+    index = steps["region"][0, 0]
+    region, areas, currents = env.region[index], steps.get("no_go_areas", None), steps.get("motion_error", None)
+    path, target = path_of(steps, region), region.unwrapped(steps["target_position"][:1].double())
     rings = path.new_empty(0, 1, 2) if areas is None else outlines(areas[0], target[0])
-    draw_map(axes, field, torch.cat((path, target, rings.flatten(0, 1))), coast=len(env.region) == 1)
-    if (numbers := steps.get("motion_error", None)) is not None:
-        corners = (torch.tensor((*axes.get_ylim(), *axes.get_xlim())).reshape(2, 2).T).double()
-        draw_currents(axes, numbers[0].double(), *corners)
+    box = box_around(axes, torch.cat((path, target, rings.flatten(0, 1))), room_km) if room_km else region
+    if currents is None:
+        field = partial(env.field, index=index) if len(env.region) > 1 else env.field
+        draw_map(axes, field, box, alpha=0.6, linewidth=1.4)
+    else:
+        draw_currents(axes, currents[0].double(), box, 12)
     for ring in rings:
-        axes.fill(*ring.T.flip(0), color=AREA, alpha=0.5)
-    axes.plot(*path.T.flip(0), ".-", color=BLUE, lw=2, ms=8)
-    axes.plot(*path[0].flip(0)[:, None], "s", color=START, ms=9)
-    axes.plot(*target.T.flip(0), "^", color=TARGET, ms=10)
-    return figure
+        axes.fill(*ring.T.flip(0), color=AREA, zorder=2)
+    axes.plot(*path.T.flip(0), ".-", color="black", lw=3, ms=10)
+    axes.plot(*path[0].flip(0)[:, None], "s", color=START, ms=11)
+    axes.plot(*target.T.flip(0), "^", color=TARGET, ms=14)
 
 
-def eddies_picture(episode: int = EDDY_EPISODE) -> Figure:
-    """Return two vehicles in an episode of *Eddies*, over its currents: by the true bearing, and the trained agent."""
-    figure = Figure(figsize=(7, 5), dpi=100, layout="constrained")
-    axes, paths = figure.subplots(), []
-    for name, label, color in (("geodesic", "true bearing", VERMILION), ("eddies", "trained agent", BLUE)):
-        steps = flown("eddies", name, VEHICLES)[1][episode]
-        steps = steps[first_episode_mask(steps["next", "done"][None])[0].flatten()]
-        paths.append(torch.cat((steps["position"][:1], steps["next", "position"])).double())
-        end = "arrives" if steps["next", "success"][-1].item() else "does not arrive"
-        spent = f"{label}: {end}, {steps['next', 'leg'][:, 0].sum():.0f} km through the water"
-        axes.plot(*paths[-1].T.flip(0), "o-", color=color, lw=2, ms=4, label=spent)
+def path_of(steps: TensorDictBase, region: Region) -> Tensor:
+    """Return the places ``(T + 1, 2)`` [deg] of an episode."""
+    return region.unwrapped(torch.cat((steps["position"][:1], steps["next", "position"])).double())
+
+
+def eddies_picture() -> Figure:
+    """Return the true bearing and the trained agent in an episode of *Eddies*, over its currents.
+
+    Of the first vehicles, the scores of both are nearest to their medians over all episodes in this one.
+    """
+    figure = Figure(figsize=(7.2, 7.4), dpi=100)
+    axes, paths = figure.add_axes((0.01, 0.22, 0.98, 0.77)), []
+    navigator, number = TASKS["eddies"].picture
+    for name, label, color in (("geodesic", "true bearing", VERMILION), (navigator, "trained agent", BLUE)):
+        env, rollout = flown("eddies", name, VEHICLES)
+        steps = first_episode(rollout[number])
+        paths.append(path_of(steps, env.region[0]))
+        spent = f"{label}: {steps['next', 'leg'][:, 0].sum():.0f} km through the water"
+        axes.plot(*paths[-1].T.flip(0), "o-", color=color, lw=3, ms=7, label=spent)
     target = steps["target_position"][0].double()
-    shown = torch.cat([*paths, target[None]])
-    arrows = draw_currents(axes, steps["motion_error"][0].double(), shown.amin(0) - 0.6, shown.amax(0) + 0.6)
-    axes.quiverkey(arrows, 0.85, 1.04, 1.0, "1 km/h", labelpos="E")
-    axes.set_title("currents, which the agent sees at its place alone", loc="left", fontsize=10)
-    axes.plot(*paths[0][0].flip(0)[:, None], "s", color="black", ms=8, label="start")
+    arrows = draw_currents(axes, steps["motion_error"][0].double(), box_around(axes, torch.cat(paths)), 18)
+    key = {"labelpos": "E", "coordinates": "figure", "fontproperties": {"size": 18}, "labelsep": 0.3}
+    axes.quiverkey(arrows, 0.13, 0.035, 1.0, "1 km/h, the speed of the vehicle", **key)
+    axes.plot(*paths[0][0].flip(0)[:, None], "s", color=START, ms=13)
     circle = displacement_ellipse(target, torch.zeros(2), WITHIN_KM**2 * torch.eye(2), deviations=1)
-    axes.plot(*circle.T.flip(0), color=TARGET, lw=2, label="destination, within 25 km")
-    axes.set(xlabel="longitude [°]", ylabel="latitude [°]", aspect=1 / math.cos(math.radians(target[0])))
-    figure.legend(loc="outside lower center", fontsize=10, ncols=2)
+    axes.plot(*circle.T.flip(0), color=TARGET, lw=4, label="destination, within 25 km")
+    figure.legend(loc="lower left", bbox_to_anchor=(0.06, 0.04), fontsize=18, frameon=False, labelspacing=0.3)
+    draw_scale(axes, 100.0)
     return figure
 
 
-def draw_currents(axes: Axes, numbers: Tensor, low: Tensor, high: Tensor) -> Quiver:
-    """Draw and return the currents of an episode of *Eddies* between two corners ``(2,)`` [deg]."""
-    ends = zip(low.tolist(), high.tolist(), strict=True)
-    latitude, longitude = (torch.linspace(*pair, 18, dtype=torch.float64) for pair in ends)
-    places = torch.cartesian_prod(latitude, longitude)
+def draw_currents(axes: Axes, numbers: Tensor, box: Region, side: int) -> Quiver:
+    """Draw and return the currents of an episode of *Eddies* at places of a square grid in a box."""
+    lines = (torch.linspace(*ends, side + 2).double()[1:-1] for ends in (box.latitude, box.longitude))
+    places = torch.cartesian_prod(*lines)
     phases, directions = numbers[3:].tensor_split([EDDIES], -1)
     waves = eddy_waves(directions, EDDY_MOTION["eddy_km"])
     north, east = (EDDY_MOTION["eddies_km_h"] * eddy_velocity(places, waves, phases)).T
-    return axes.quiver(*places.T.flip(0), east, north, color=AREA, width=0.003, scale=25)
+    axes.set(xlim=box.longitude, ylim=box.latitude, xticks=[], yticks=[])
+    return axes.quiver(*places.T.flip(0), east, north, color=AREA, width=0.06 / side, scale=1.3 * side)
 
 
-def draw_errors(figure: Figure, errors: Tensor) -> None:
-    """Draw errors ``(T, 3)`` of readings by step, a panel for each element."""
-    panels = figure.subplots(3, sharex=True, gridspec_kw={"left": 0.19, "right": 0.98, "bottom": 0.15, "top": 0.98})
-    for axes, values, (name, color), unit in zip(panels, errors.T, ELEMENT_COLORS.items(), UNITS, strict=True):
-        axes.plot(values, color=color, lw=1.5)
-        axes.axhline(0, color=AREA, lw=0.8)
-        axes.annotate(f"{SYMBOLS[name]} [{unit}]", (0.02, 0.78), xycoords="axes fraction")
-        axes.margins(0.02, 0.35)
-    panels[-1].set_xlabel("step")
+def draw_readings(figure: Figure, values: Tensor) -> None:
+    """Draw values of D, I and B_H ``(T, 3)`` by step, a panel for each."""
+    panels = figure.subplots(3, gridspec_kw={"left": 0.2, "right": 0.99, "bottom": 0.01, "top": 0.99})
+    for axes, series, (name, color) in zip(panels, values.T, ELEMENT_COLORS.items(), strict=True):
+        axes.axhline(0, color=AREA, lw=2)
+        axes.plot(series, ".-", color=color, lw=3, ms=10)
+        axes.set(xticks=[], yticks=[], ymargin=0.15)
+        axes.set_ylabel(SYMBOLS[name], fontsize=22, rotation=0, ha="right", va="center")
 
 
 def save_gif(path: Path, frames: Sequence[Image.Image]) -> None:
@@ -283,7 +300,8 @@ def save_gif(path: Path, frames: Sequence[Image.Image]) -> None:
     palette = Image.fromarray(sample).quantize(COLORS)  # one for all frames: unchanged pixels compress well
     start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)
     durations = [FRAME_MS] * len(others) + [LAST_MS]
-    write_with(path, start.save, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+    options = {"duration": durations, "loop": 0, "comment": f"{COMMAND}: trip {SHOWN} of table known-1200"}
+    write_with(path, start.save, "GIF", save_all=True, append_images=others, **options)
 
 
 def main(out: Path = Path("docs/figures")) -> None:
@@ -298,10 +316,10 @@ def main(out: Path = Path("docs/figures")) -> None:
         f"dead reckoning {few:.0f} of 100,\nmagrl {many:.0f} of 100 arrive"
     )
     save_gif(out / "underwater.gif", list(frames))
-    write_with(out / "eddies.png", partial(image_of(eddies_picture()).quantize(COLORS).save, format="PNG"))
-    for task in NAMED_TASKS:
-        picture = image_of(task_picture(task)).quantize(COLORS)
-        write_with(out / f"task-{task}.png", partial(picture.save, format="PNG"))
+    figures = {"eddies": eddies_picture()} | {f"task-{task}": task_picture(task) for task in NAMED_TASKS}
+    for name, figure in figures.items():
+        navigator, episode = TASKS[name.removeprefix("task-")].picture
+        write_picture(out / f"{name}.png", figure, f"{COMMAND}: {navigator} in episode {episode} of seed {SEED}")
 
 
 if __name__ == "__main__":
