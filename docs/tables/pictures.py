@@ -116,8 +116,8 @@ class Animation:
 
     def __init__(self, target: Tensor, reckoning: Voyage, filtered: Voyage) -> None:
         self.target, self.voyages = target, (reckoning, filtered)
-        self.figure = Figure(figsize=(7.2, 7.4), dpi=100)
-        axes = self.figure.add_axes((0.01, 0.13, 0.98, 0.79))
+        self.figure = Figure(figsize=(7.2, 5.8), dpi=100)
+        axes = self.figure.add_axes((0.01, 0.165, 0.98, 0.735))
         shown = torch.cat((reckoning.true, reckoning.believed, filtered.true, target[None]))
         draw_map(axes, FIELD, box_around(axes, shown), alpha=0.4)
         axes.plot(*coastlines().T[::-1], color=LAND, lw=2.5)
@@ -136,7 +136,7 @@ class Animation:
         ]
         handles = [self.lines[1], self.lines[0], self.lines[2], self.ellipse]
         self.figure.legend(handles=handles, loc="lower center", ncols=2, fontsize=18, frameon=False)
-        self.texts = [self.figure.text(x, 0.957, "", color=color, fontsize=19, va="center") for x, color in COUNTER]
+        self.texts = [self.figure.text(x, 0.95, "", color=color, fontsize=19, va="center") for x, color in COUNTER]
         self.texts[0].set_ha("right")
 
     def image(self, time: float, verdict: str = "") -> Image.Image:
