@@ -182,7 +182,7 @@ def test_own_errors_in_a_file() -> None:
     [
         (
             "speed = 3",
-            r"mine\.toml: Conditions have name, .*errors motion, weather, sensors, spikes, north, got 'speed'",
+            rf"mine\.toml: Conditions have name, .*errors {', '.join(ERRORS)}, got 'speed'",
         ),
         ("sensors.bais = [1, 1, 1]", r"SensorErrors has no option 'bais': choose from noise, bias, .*levels, stated$"),
         ("sensors.seed = 3", r"SensorErrors has no option 'seed'"),
