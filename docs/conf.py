@@ -11,7 +11,9 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
 from docutils import nodes  # noqa: E402
+from sphinx.ext.autodoc.preserve_defaults import update_defvalue  # noqa: E402
 from sphinx.pycode import ModuleAnalyzer  # noqa: E402
+from sphinx.util import inspect as sphinx_inspect  # noqa: E402
 from sphinx.util.nodes import make_refnode  # noqa: E402
 
 import magrl  # noqa: E402 - this tree, not an installed version
@@ -40,6 +42,7 @@ nb_output_stderr = "remove"  # warnings and logs of libraries
 autodoc_mock_imports = ["stable_baselines3"]
 autodoc_default_options = {"ignore-module-all": True}  # describe a name only where it is defined
 autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True  # the names of constants, not their values
 autodoc_inherit_docstrings = False  # do not repeat TorchRL's docstrings
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
@@ -55,19 +58,32 @@ def prepare(app: Any, name: str, content: list[str]) -> None:  # noqa: ARG001
 
 
 def describe(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:  # noqa: ARG001
-    """Describe an imported constant as where it is defined; keep initials of authors from becoming lists."""
-    lines[:] = [re.sub(r"^(\s*)([A-Z]\. )", r"\1\\\2", line) for line in lines]
+    """Describe an imported constant as where it is defined; mend what napoleon takes for a type or a list."""
+    lines[:] = [re.sub(r"^(\s*)([A-Z]\. )", r"\1\\\2", line) for line in lines]  # initials of authors
+    if what in {"attribute", "property", "data"} and lines and lines[-1].startswith(":type: "):
+        lines[0] = f"{lines.pop().removeprefix(':type: ')}: {lines[0]}"  # a sentence before its colon
     for module in [module for module in sys.modules if what == "data" and module.startswith("magrl.")]:
         lines[:] = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", name.rpartition(".")[2]), lines)
 
 
+def skip_numbers(*event: Any) -> bool | None:
+    """Leave out fields that a tuple documents by their number alone: its class describes them."""
+    return True if str(getattr(event[3], "__doc__", "")).startswith("Alias for field number") else None
+
+
 def show_arguments(*event: Any) -> tuple[str, str | None] | None:
-    """Show the arguments of a class whose metaclass, such as TorchRL's of environments, takes any."""
-    _, what, _, obj, _, signature, returned = event
-    if what != "class" or signature != "(*args, **kwargs)":
+    """Show the arguments of a class whose metaclass takes any, such as TorchRL's; leave out types with validators."""
+    app, what, _, obj, _, signature, returned = event
+    if what != "class" or not re.search(r"^\(\*args|Annotated\[|<factory>", signature or ""):
         return None
-    own = inspect.signature(obj.__init__)
-    return str(own.replace(parameters=list(own.parameters.values())[1:], return_annotation=own.empty)), returned
+    if signature.startswith("(*args"):
+        update_defvalue(app, obj.__init__, False)
+        own = sphinx_inspect.signature(obj.__init__, bound_method=True)
+    else:
+        own = inspect.signature(obj)
+        own = own.replace(parameters=[each.replace(annotation=each.empty) for each in own.parameters.values()])
+    shown = sphinx_inspect.stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
+    return re.sub(r"^\(\*args.*", "()", shown).replace("<factory>", "{}"), returned
 
 
 WORDS = {*KEYS, "step_price"}
@@ -108,5 +124,6 @@ def setup(app: Any) -> None:
     app.connect("source-read", prepare)
     app.connect("autodoc-process-docstring", describe, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", show_arguments)
+    app.connect("autodoc-skip-member", skip_numbers)
     app.connect("doctree-resolved", link_names)
     app.connect("doctree-resolved", list_names)
