@@ -8,8 +8,6 @@ leg d, over which D and I change by c, Broyden's update makes J explain it: J + 
 
 from __future__ import annotations
 
-import math
-
 from magrl import GeomagneticNavEnv, Scenario, episode_measures, evaluation_rollout, summarize
 from magrl.geodesy import steer
 from magrl.guidance import displacement_to
@@ -22,10 +20,6 @@ from torch import Tensor
 
 class SimpleSecant(Navigator):
     """Make two legs at a right angle, then quasi-Newton steps to the destination."""
-
-    def __init__(self, max_leg_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
-        super().__init__(max_leg_km, max_turn_rad)
-        self.in_keys = ["field", "target_field", "heading", "leg", "elapsed_steps"]  # no position, no map
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return what an episode starts with: the reading, and an unknown Jacobian of D and I."""

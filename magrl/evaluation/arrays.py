@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,7 +41,7 @@ class ArrayPolicy(Navigator):
         tensor([0.0000, 0.1000, 0.2000])
     """
 
-    in_keys: ClassVar[list[str]] = ["observation", "elapsed_steps"]
+    in_keys = ("observation", "elapsed_steps")
 
     def __init__(self, act: Act) -> None:
         super().__init__()

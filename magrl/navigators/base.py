@@ -20,7 +20,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform, TransformedEnv
 
 from magrl.checks import check_number
-from magrl.envs import GeomagneticNavEnv
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.pilot import Rules
 from magrl.sensor_std import PERFECT, STD_KEYS, SensorStd
 from magrl.transforms import DeclareArrival, TrackField
@@ -28,17 +28,16 @@ from magrl.transforms.track import known_keys
 
 MEMORY = "memory"
 """Key of what a policy remembers of its episode."""
-_REMEDY = "policy_env(env, policy) returns the environment that has it"
 
 
 class Navigator(TensorDictModuleBase):
     """Base class of untrained policies: action bounds, and a memory of the episode in the TensorDict.
 
-    A subclass sets its ``in_keys``, and chooses the next leg in :meth:`decide`. A navigator that remembers returns its
-    memory at the start of an episode (``elapsed_steps`` 0) in :meth:`first_memory`; it reads ``("memory", ...)`` and
-    writes ``("next", "memory", ...)``, as recurrent modules of TorchRL do, so that its actions depend on the TensorDict
-    alone. :func:`policy_env` adds these keys to an environment. With the class attributes below, and a place in the
-    list of :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
+    A subclass chooses the next leg in :meth:`decide`. A navigator that remembers returns its memory at the start of an
+    episode (``elapsed_steps`` 0) in :meth:`first_memory`; it reads ``("memory", ...)`` and writes
+    ``("next", "memory", ...)``, as recurrent modules of TorchRL do, so that its actions depend on the TensorDict alone.
+    :func:`policy_env` adds these keys to an environment. With the class attributes below, and a place in the list of
+    :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
 
     Args:
         max_leg_km: longest leg [km].
@@ -51,10 +50,8 @@ class Navigator(TensorDictModuleBase):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.geodesy import steer
         >>> class DueEast(Navigator):
-        ...     in_keys = ["heading", "elapsed_steps"]
-        ...
         ...     def decide(self, seen, memory):
-        ...         heading = seen["heading"].squeeze(-1)
+        ...         heading = seen["heading"]
         ...         east, distance = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
         ...         return steer(heading, east, distance, self.max_leg_km, self.max_turn_rad)
         >>> GeomagneticNavEnv(num_envs=1, seed=0).rollout(2, DueEast())["action"].round(decimals=2)
@@ -62,12 +59,14 @@ class Navigator(TensorDictModuleBase):
                  [30.0000,  0.0000]]])
     """
 
+    in_keys: Any
+    """Keys that it reads; by default, the public keys and ``elapsed_steps``."""
     name: str
-    """Name in commands."""
+    """Name in commands; by default, that of the class."""
     label: str
-    """Label in figures."""
+    """Label in figures; by default, the name."""
     description: str
-    """Label in tables."""
+    """Label in tables; by default, the label in figures."""
     oracle: bool = False
     """Whether the navigator reads privileged keys, or the field where the vehicle has not been."""
     needs: str = "nothing"
@@ -83,11 +82,19 @@ class Navigator(TensorDictModuleBase):
     options: tuple[str, ...] = ()
     """Further options of :meth:`for_env` that a command has: ``seed``."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        own = vars(cls)
+        cls.name = own.get("name", cls.__name__)
+        cls.label = own.get("label", cls.name)
+        cls.description = own.get("description", cls.label)
+
     def __init__(self, max_leg_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
         super().__init__()
         check_number(0, above=True, max_leg_km=max_leg_km)
         check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
         self.max_leg_km, self.max_turn_rad = float(max_leg_km), float(max_turn_rad)
+        self.in_keys = list(getattr(self, "in_keys", (*PUBLIC_KEYS, "elapsed_steps")))
         self.out_keys = ["action"]
 
     @property
@@ -152,26 +159,23 @@ class Navigator(TensorDictModuleBase):
         return {}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor] | Tensor:
-        """Return distance [km] and turn [rad], each ``(N,)``, or the whole action ``(N, A)``; set what changes in the
-        memory."""
-        raise NotImplementedError
+        """Return distance [km] and turn [rad], each ``(N,)`` or ``(N, 1)``, or the whole action ``(N, A)``; set what
+        changes in the memory."""
+        raise NotImplementedError(f"{type(self).__name__} has no method decide(seen, memory), which chooses its legs")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]; with a declaration, ``(N, 3)``."""
-        seen = self._seen(tensordict)
-        memory = recalled(tensordict, partial(self.first_memory, seen)) if self.remembers else seen.empty()
-        chosen = self.decide(seen, memory)
-        action = chosen if isinstance(chosen, Tensor) else torch.stack(chosen, -1)
-        tensordict.set("action", action.to(torch.float32))
-        return tensordict.set(("next", MEMORY), memory) if self.remembers else tensordict
-
-    def _seen(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return what it reads; raise a KeyError that names what is missing."""
         try:
-            return tensordict.select(*self.in_keys).update(tensordict.select(*self.optional_keys, strict=False))
+            seen = tensordict.select(*self.in_keys).update(tensordict.select(*self.optional_keys, strict=False))
+            memory = recalled(tensordict, partial(self.first_memory, seen)) if self.remembers else seen.empty()
+            chosen = self.decide(seen, memory)
         except KeyError as error:
-            missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
-            raise KeyError(f"{type(self).__name__} reads {missing}: {_REMEDY}") from error
+            reads = f"{type(self).__name__} reads {self.in_keys}, its in_keys"
+            remedy = "policy_env(env, policy) returns an environment with a memory, or with a track"
+            raise KeyError(f"{reads}: {error.args[0]}; {remedy}") from error
+        columns = [chosen] if isinstance(chosen, Tensor) else [each.reshape(*tensordict.shape, 1) for each in chosen]
+        tensordict.set("action", torch.cat(columns, -1).to(torch.float32))
+        return tensordict.set(("next", MEMORY), memory) if self.remembers else tensordict
 
 
 def recalled(tensordict: TensorDictBase, first: Callable[[], Mapping[str, Tensor]]) -> TensorDictBase:
@@ -186,10 +190,7 @@ def recalled(tensordict: TensorDictBase, first: Callable[[], Mapping[str, Tensor
         >>> recalled(state, lambda: {"path": torch.zeros(2)})["path"]
         tensor([ 0., 90.])
     """
-    memory = tensordict.get(MEMORY, None)
-    if memory is None:
-        raise KeyError(f"the policy reads its {MEMORY!r}, which is not in the TensorDict: {_REMEDY}")
-    begins = tensordict["elapsed_steps"].squeeze(-1) == 0
+    memory, begins = tensordict[MEMORY], tensordict["elapsed_steps"].squeeze(-1) == 0
     if not begins.any():
         return memory.copy()
     start = TensorDict(dict(first()), batch_size=begins.shape, device=begins.device)

@@ -44,7 +44,6 @@ class DeadReckoning(Navigator):
 
     name = "dead_reckoning"
     label = "dead reckoning"
-    description = "dead reckoning"
     needs = "the start and the destination"
     optional_keys: ClassVar[tuple[str, ...]] = (*PLACE_KEYS, "bias_std")
 

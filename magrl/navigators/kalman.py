@@ -45,7 +45,7 @@ class Kalman(Navigator):
     label = "Kalman"
     description = "Kalman (dual control)"
     needs = "the field's spectrum"
-    in_keys: ClassVar[list[str]] = [*READ_KEYS, "track"]
+    in_keys = (*READ_KEYS, "track")
     optional_keys: ClassVar[tuple[str, ...]] = KNOWN_KEYS
 
     def __init__(self, rules: Rules | None = None, network: nn.Module | None = None, **changes: Any) -> None:
@@ -91,7 +91,6 @@ class Anywhere(Kalman):
     """
 
     name = "anywhere"
-    label = "anywhere"
     description = "anywhere (PPO)"
     trained_on = "random planets"
 

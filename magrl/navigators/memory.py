@@ -101,7 +101,6 @@ class Memory(Navigator):
     """
 
     name = "memory"
-    label = "memory"
     description = "memory (recurrent PPO)"
     trained_on = "random planets"
     optional_keys = ACCURACY_KEYS
@@ -115,7 +114,6 @@ class Memory(Navigator):
         **limits: float,
     ) -> None:
         super().__init__(**{name: min(limits.get(name, limit), limit) for name, limit in LIMITS.items()})
-        self.in_keys = ["field", "target_field", "leg", "heading", "elapsed_steps"]
         network, known = (source, None) if isinstance(source, MemoryNetwork) else self._read(source)
         self.network = network.float()  # environments write float32
         self.register_buffer("accuracy", _ends(accuracy or known), persistent=False)

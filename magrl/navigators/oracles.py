@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -38,10 +38,10 @@ class Geodesic(Navigator):
         tensor(True)
     """
 
-    name = label = "geodesic"
+    name = "geodesic"
     description = "geodesic (both positions, an oracle)"
     oracle, needs = True, "the position"
-    in_keys: ClassVar[list[str]] = ["position", "target_position", "heading", "elapsed_steps"]
+    in_keys = ("position", "target_position", "heading", "elapsed_steps")
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         distance, bearing = geodesy.geodesic(*seen["position"].unbind(-1), *seen["target_position"].unbind(-1))
@@ -71,7 +71,7 @@ class ParallelApproach(Navigator):
         tensor(True)
     """
 
-    name = label = "parallel"
+    name = "parallel"
     description = "parallel (true gradient, an oracle)"
     oracle, needs = True, "the gradient"
 

@@ -230,7 +230,6 @@ class QuasiNewton(Navigator):
         check_number(0, above=True, zeta=zeta)
         check_number(0, above=True, optional=True, radius_km=radius_km)
         self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
-        self.in_keys = ["field", "target_field", "heading", "leg", "elapsed_steps"]
         if len(set(elements)) != len(elements) or len(elements) < 2:
             raise ValueError(f"elements must be at least 2 different names of D, I, B_H, got {elements!r}")
         self.elements = [element_index(name) for name in elements]
@@ -393,7 +392,7 @@ class Secant(QuasiNewton):
         probing, probe_turn = decisions <= 2, torch.where(decisions == 2, self.probe_turn, 0.0)
         return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)
 
-    name = label = "secant"
+    name = "secant"
     description = "secant (quasi-Newton)"
 
 

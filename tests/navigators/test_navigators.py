@@ -12,9 +12,10 @@ from tensordict import TensorDict
 from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from magrl.envs import GeomagneticNavEnv, Region, Scenario, trip_set
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, trip_set
 from magrl.errors import Conditions, SensorErrors, with_conditions
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
+from magrl.evaluation.tables import short_table
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic
 from magrl.guidance import displacement_to
@@ -134,6 +135,30 @@ def test_each_navigator_declares_what_it_is() -> None:
         assert kind.description.startswith(kind.label)
         assert not kind.oracle or kind.needs != Navigator.needs
         assert not kind.oracle or "an oracle" in kind.description
+
+
+def test_a_navigator_of_ones_own_needs_a_rule_alone(env) -> None:
+    """It reads what a vehicle reads, its class is its name, and a column is as good as a vector."""
+    vectors = type("Own", (Navigator,), {"decide": lambda _, seen, __: seen["leg"].clamp(1, 1.5).unbind(-1)})
+    columns = type("Longer", (vectors,), {"decide": lambda _, seen, __: seen["leg"].clamp(1, 1.5).split(1, -1)})
+    assert (columns.name, columns.label, columns.description) == ("Longer",) * 3
+    assert short_table({vectors: [flown(env, vectors())]}).splitlines()[-1].startswith("| Own | nothing |")
+    assert vectors().in_keys == [*PUBLIC_KEYS, "elapsed_steps"]
+    torch.testing.assert_close(*(env.rollout(3, own())["action"] for own in (vectors, columns)))
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"in_keys": ["headin"]}, r"Own reads .*headin.*, its in_keys: .*headin.* not found .*heading"),
+        ({"decide": lambda _, seen, __: seen["position"]}, r"Own reads .*leg.*, its in_keys: .*position.* not found"),
+        ({"first_memory": lambda *_: {}}, r"memory.* not found.*policy_env\(env, policy\) returns"),
+        ({}, r"Own has no method decide\(seen, memory\)"),
+    ],
+)
+def test_what_a_navigator_of_ones_own_lacks_is_named(env, own: dict, message: str) -> None:
+    with pytest.raises((KeyError, NotImplementedError), match=message):
+        type("Own", (Navigator,), own)()(env.reset())
 
 
 @pytest.mark.parametrize("name", sorted(NAVIGATORS))
