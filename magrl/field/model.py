@@ -103,7 +103,7 @@ def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]
 
     Args:
         field: field model.
-        position: ``(..., 2)`` latitude, longitude [deg], for example :meth:`magrl.envs.Region.grid`.
+        position: ``(..., 2)`` latitude, longitude [deg], for example :meth:`magrl.envs.Regions.grid`.
 
     Returns:
         Two tensors ``(3,)``: D [deg], I [deg], B_H [nT].
