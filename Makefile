@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format lock docs docs-slow bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format lock docs docs-slow notebook bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -54,13 +54,16 @@ lock:  ## write constraints.txt with the newest versions of all but torch, from 
 
 SPHINX := $(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet
 
-docs: $(VENV)/.installed-docs  ## build the documentation in build/docs, without the outputs of the notebook
+docs: $(VENV)/.installed-docs  ## build the documentation in build/docs, with the outputs that the tutorial keeps
 	$(SPHINX) -D nb_execution_mode=off docs build/docs
 	@echo "Open build/docs/index.html"
 
-docs-slow: $(VENV)/.installed-docs  ## build it with the outputs of the notebook; two minutes
+docs-slow: $(VENV)/.installed-docs  ## build it and run the tutorial; two minutes
 	$(SPHINX) docs build/docs
 	@echo "Open build/docs/index.html"
+
+notebook: $(VENV)/.installed-docs  ## run the tutorial and keep its outputs in docs/tutorial.ipynb; two minutes
+	OMP_NUM_THREADS=1 $(RUN)/python docs/tables/notebook.py
 
 bench: $(VENV)/.installed-dev  ## run the benchmarks; about four minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)

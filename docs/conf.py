@@ -1,6 +1,7 @@
 """Sphinx configuration: `make docs` builds the documentation in build/docs, without network access."""
 
 import inspect
+import os
 import re
 import sys
 from collections import defaultdict
@@ -37,7 +38,8 @@ myst_heading_anchors = 3
 
 nb_execution_mode, nb_execution_timeout = "force", 600  # a cell [s]
 nb_execution_raise_on_error = nb_execution_in_temp = nb_merge_streams = True
-nb_output_stderr = "remove"  # warnings and logs of libraries
+nb_output_stderr = "remove"  # warnings of libraries
+os.environ["RL_LOGGING_LEVEL"] = "ERROR"  # logs of TorchRL, which are not on stderr
 
 autodoc_mock_imports = ["stable_baselines3"]
 autodoc_default_options = {"ignore-module-all": True}  # describe a name only where it is defined
