@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
 from docutils import nodes  # noqa: E402
+from sphinx import addnodes  # noqa: E402
 from sphinx.ext.autodoc.preserve_defaults import update_defvalue  # noqa: E402
 from sphinx.pycode import ModuleAnalyzer  # noqa: E402
 from sphinx.util import inspect as sphinx_inspect  # noqa: E402
@@ -88,6 +89,14 @@ def show_arguments(*event: Any) -> tuple[str, str | None] | None:
     return re.sub(r"^\(\*args.*", "()", shown).replace("<factory>", "{}"), returned
 
 
+def show_types(app: Any, domain: str, kind: str, content: Any) -> None:  # noqa: ARG001
+    """Show the type of a field with its range, without the code that checks it."""
+    for node in content.parent.findall(addnodes.desc_annotation):
+        if match := re.fullmatch(r": Annotated\[(.+?), \w+\(.*\)\]", node.astext()):
+            limits = ", ".join(re.findall(r"\b[gl][te]=[^,)]+", node.astext()))
+            node[:] = [nodes.Text(f": {match[1]}" + (f" ({limits})" if limits else ""))]
+
+
 WORDS = {*KEYS, "step_price"}
 """Keys and options with the name of a function, which are not linked to it."""
 
@@ -102,7 +111,8 @@ def link_names(app: Any, doctree: nodes.document, page: str) -> None:
             short[name].append(entry)
     for code in list(doctree.findall(nodes.literal)):
         text = code.astext().partition("(")[0]
-        found = [entries[text]] if text in entries else short.get(text.removeprefix("magrl."), [])
+        name = text.rpartition(".")[2] if text.startswith("magrl.") else text
+        found = [entries[text]] if text in entries else short.get(name, [])
         if len(found) == 1 and not isinstance(code.parent, nodes.reference | nodes.title):
             code.replace_self(make_refnode(app.builder, page, found[0].docname, found[0].node_id, code.deepcopy()))
 
@@ -127,5 +137,6 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", describe, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", show_arguments)
     app.connect("autodoc-skip-member", skip_numbers)
+    app.connect("object-description-transform", show_types)
     app.connect("doctree-resolved", link_names)
     app.connect("doctree-resolved", list_names)
