@@ -153,8 +153,8 @@ class Animation:
         for text, content in zip(self.texts, shown, strict=True):
             text.set_text(content)
         if verdict:
-            box = {"facecolor": "white", "edgecolor": BLUE, "lw": 2, "pad": 16}
-            self.figure.text(0.56, 0.8, verdict, fontsize=27, ha="center", va="center", linespacing=1.6, bbox=box)
+            box = {"facecolor": "white", "edgecolor": BLUE, "lw": 2, "pad": 14}
+            self.figure.text(0.62, 0.36, verdict, fontsize=24, ha="center", va="center", linespacing=1.6, bbox=box)
         return image_of(self.figure)
 
     def frames(self, verdict: str) -> Iterator[Image.Image]:
