@@ -85,9 +85,10 @@ class Navigator(TensorDictModuleBase):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         own = vars(cls)
-        cls.name = own.get("name", cls.__name__)
-        cls.label = own.get("label", cls.name)
-        cls.description = own.get("description", cls.label)
+        if "name" in own or not hasattr(cls, "name"):  # otherwise it has those of the class that it changes
+            cls.name = own.get("name", cls.__name__)
+            cls.label = own.get("label", cls.name)
+            cls.description = own.get("description", cls.label)
 
     def __init__(self, max_leg_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
         super().__init__()

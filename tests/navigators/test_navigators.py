@@ -140,8 +140,10 @@ def test_each_navigator_declares_what_it_is() -> None:
 def test_a_navigator_of_ones_own_needs_a_rule_alone(env) -> None:
     """It reads what a vehicle reads, its class is its name, and a column is as good as a vector."""
     vectors = type("Own", (Navigator,), {"decide": lambda _, seen, __: seen["leg"].clamp(1, 1.5).unbind(-1)})
-    columns = type("Longer", (vectors,), {"decide": lambda _, seen, __: seen["leg"].clamp(1, 1.5).split(1, -1)})
+    columns = type("Longer", (Navigator,), {"decide": lambda _, seen, __: seen["leg"].clamp(1, 1.5).split(1, -1)})
     assert (columns.name, columns.label, columns.description) == ("Longer",) * 3
+    changed = type("Changed", (type("Named", (columns,), {"name": "named"}),), {"description": "named, changed"})
+    assert (changed.name, changed.label, changed.description) == ("named", "named", "named, changed")
     assert short_table({vectors: [flown(env, vectors())]}).splitlines()[-1].startswith("| Own | nothing |")
     assert vectors().in_keys == [*PUBLIC_KEYS, "elapsed_steps"]
     torch.testing.assert_close(*(env.rollout(3, own())["action"] for own in (vectors, columns)))
