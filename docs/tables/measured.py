@@ -2,8 +2,9 @@
 
     python docs/tables/measured.py LOG.csv --out docs/results
 
-The log is a CSV file with the columns time, D, I, B_H, heading, distance, latitude, longitude and altitude_km;
-docs/results.md says which one the published table has. Each piece of the track is a flight from its first row to its
+The log is a CSV file with the columns time, D, I, B_H, heading, distance (on the ground), latitude, longitude and
+altitude_km. That of the published table is of Swarm A on 1 January 2016, 00:13:40 to 00:30 UTC, a row every 6 s: ESA's
+product SW_OPER_MAGA_LR_1B (B_NEC), from VirES for Swarm. Each piece of the track is a flight from its first row to its
 last. The vehicle reads D, I, B_H of the log with white noise. The destination's elements, and those of a known start,
 are of the log, as from a survey, or of IGRF at its altitude.
 """

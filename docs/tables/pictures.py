@@ -154,7 +154,7 @@ class Animation:
             text.set_text(content)
         if verdict:
             box = {"facecolor": "white", "edgecolor": BLUE, "lw": 2, "pad": 14}
-            self.figure.text(0.62, 0.36, verdict, fontsize=24, ha="center", va="center", linespacing=1.6, bbox=box)
+            self.figure.text(0.66, 0.76, verdict, fontsize=22, ha="center", va="center", linespacing=1.6, bbox=box)
         return image_of(self.figure)
 
     def frames(self, verdict: str) -> Iterator[Image.Image]:
