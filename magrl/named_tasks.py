@@ -239,12 +239,13 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
     return env
 
 
-@named_task("Eddies", version=1, threshold=9.7)
+@named_task("Eddies", version=2, threshold=9.7)
 def eddies_env(num_envs: int = 1, *, eddies_km_h: float = EDDY_MOTION["eddies_km_h"], **options: Any) -> TransformedEnv:
     """Return the environment *Box* of an underwater glider at 1 km/h, in eddies that are about as fast.
 
-    The currents are unknown, and other ones in each episode: a vehicle that steers for its destination is carried
-    around. It has a map of the field, so that each reading is a fix of its position, and shows the last set.
+    The currents are unknown, and other ones in each episode: a vehicle that steers for its destination drifts off. It
+    has a map of the field, so that each reading is a fix of its position, and shows the last set. As it knows the
+    wavelength of the eddies, it also observes the currents to expect around it.
 
     Args:
         num_envs: vehicles in the batch.
@@ -255,7 +256,7 @@ def eddies_env(num_envs: int = 1, *, eddies_km_h: float = EDDY_MOTION["eddies_km
 
     Example:
         >>> eddies_env(4, seed=0).rollout(3)["observation"].shape
-        torch.Size([4, 3, 47])
+        torch.Size([4, 3, 111])
     """
     from magrl.envs.navigation import navigation_env
     from magrl.errors import MotionError

@@ -47,12 +47,13 @@ def navigation_env(
     Args:
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, scaled to the region: the input of the recipes'
-            networks. ``"legs"`` adds ``observation``, ``(N, 47)``, what a map of the region says of the last eight legs
-            (:class:`~magrl.transforms.RecentLegs`). ``"track"`` adds ``observation``, ``(N, 19)``, estimates of the own
-            track (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 26)``, readings without estimates
-            (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"dict"`` leaves the public
-            keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view of
-            ``"flat"`` and of ``"legs"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
+            networks. ``"legs"`` adds ``observation``, ``(N, 111)``, what a map of the region says of the last eight
+            legs (:class:`~magrl.transforms.RecentLegs`) and of the currents around
+            (:class:`~magrl.transforms.ExpectedCurrents`). ``"track"`` adds ``observation``, ``(N, 19)``, estimates of
+            the own track (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 26)``, readings without
+            estimates (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"dict"`` leaves the
+            public keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view
+            of ``"flat"`` and of ``"legs"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
         transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
         reward: ``"spl"``, the default, is :class:`~magrl.transforms.SPLReward`: an episode that arrives earns 10 times
             its SPL, a failure less than 5. ``"paper"`` is the paper's: decrease of the objective, 200 at the arrival,

@@ -168,28 +168,27 @@ class SoftUpdate:
                 target.lerp_(source, self.tau)
 
 
-def mirrored(transitions: TensorDictBase, signs: Tensor | None) -> TensorDictBase:
-    """Return transitions, of which a random half are in mirror image; without signs, as they are.
+def mirrored(transitions: TensorDictBase, mirror: Tensor | None) -> TensorDictBase:
+    """Return transitions, of which a random half are in mirror image; without a map to it, as they are.
 
     Args:
         transitions: ``(B,)`` with ``observation``, ``action`` and ``next``.
-        signs: ``(K,)`` of an observation in the mirror image, as of :attr:`magrl.transforms.LegsView.mirror`; a turn
-            changes its sign, too.
+        mirror: linear map ``(K, K)`` of an observation, as :attr:`magrl.transforms.LegsView.mirror`; a turn changes its
+            sign.
 
     Example:
         >>> after = TensorDict(observation=torch.ones(9, 2), batch_size=[9])
         >>> batch = TensorDict(observation=torch.ones(9, 2), action=torch.ones(9, 2), next=after, batch_size=[9])
-        >>> found = mirrored(batch, torch.tensor([1.0, -1.0]))
+        >>> found = mirrored(batch, torch.tensor([[1.0, 0.0], [0.0, -1.0]]))
         >>> torch.equal(found["action"], found["next", "observation"])
         True
     """
-    if signs is None:
+    if mirror is None:
         return transitions
-    drawn = torch.rand(*transitions.shape, 1, device=signs.device) < 0.5
-    observed, turned = torch.where(drawn, signs, 1.0), torch.where(drawn, signs.new_tensor((1.0, -1.0)), 1.0)
-    found = transitions.copy()
-    found["observation"], found["action"] = found["observation"] * observed, found["action"] * turned
-    found["next", "observation"] = found["next", "observation"] * observed
+    drawn, found = torch.rand(*transitions.shape, 1, device=mirror.device) < 0.5, transitions.copy()
+    maps = {"observation": mirror, "action": mirror.new_tensor(((1, 0), (0, -1))), ("next", "observation"): mirror}
+    for key, image in maps.items():
+        found[key] = torch.where(drawn, found[key] @ image.T, found[key])
     return found
 
 

@@ -10,7 +10,8 @@ from magrl.transforms.alignment import FieldGradient as FieldGradient
 from magrl.transforms.alignment import GradientHeading as GradientHeading
 from magrl.transforms.areas import NoGoAreas as NoGoAreas
 from magrl.transforms.areas import Shield as Shield
-from magrl.transforms.legs import CurrentReading as CurrentReading
+from magrl.transforms.currents import CurrentReading as CurrentReading
+from magrl.transforms.currents import ExpectedCurrents as ExpectedCurrents
 from magrl.transforms.legs import Fix as Fix
 from magrl.transforms.legs import RecentLegs as RecentLegs
 from magrl.transforms.rewards import DistanceCost as DistanceCost

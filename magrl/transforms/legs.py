@@ -17,11 +17,9 @@ from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import geodesic, move_place, polar
 from magrl.guidance import displacement_to
 from magrl.pilot.displacement import displacement_between
-from magrl.random_numbers import stream_normal
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms.areas import turned
 from magrl.transforms.base import Keys, StatefulTransform
-from magrl.transforms.episode import Episode, EpisodeNumbers
 from magrl.transforms.sequences import per_nanotesla
 
 GRID, MOST_STEPS = 32, 6
@@ -30,8 +28,8 @@ EXACT_KM, ALIKE_NT, NEAR_FIX_KM = 0.01, 0.1, 1.0
 """Accuracy of a fix without errors [km]; a change of the elements [nT], and by how much it may move a fix [km]."""
 FAR_KM, NEAR_KM, LEG_KM = 400.0, 20.0, 100.0
 """Units of the distance to the destination and of its logarithm, and of the distance of a leg [km]."""
-BASE_KM, SHORT_KM = 2.0, 0.05
-"""Way between two readings that show a current, and the least leg whose set is shown in full [km]; chosen."""
+SHORT_KM = 0.05
+"""Least leg whose set is shown in full [km]; chosen."""
 
 
 class Fix(StatefulTransform):
@@ -149,60 +147,6 @@ class Fix(StatefulTransform):
         for key in self.out_keys:
             self._add(observation_spec, self._leaf(observation_spec, self.in_keys[0]), key, 2, dtype=torch.float64)
         return observation_spec
-
-
-class CurrentReading(EpisodeNumbers):
-    """Write the current at the vehicle's place, as two readings show it: there, and 2 km of its way before.
-
-    A vehicle that reads all along its way sees by a map of the field how far it was carried between two readings. Their
-    errors are those of the reading: what is constant cancels, and the white noise that the vehicle states moves a fix.
-    Nothing that it writes is privileged: the true current and position say where the second reading was made.
-
-    Args:
-        field: map of the field, such as ``env.field``; no bank.
-        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.episode.EpisodeNumbers`. The
-            keys read are the reading ``(..., 3)``: D [deg], I [deg], B_H [nT]; heading ``(..., 1)`` [rad]; fix and true
-            position ``(..., 2)`` [deg]; and, where they are given, the true current over the speed ``(..., 2)``, the
-            true elements at the place, and the noise of a reading ``(..., 3)``. Written is the current over the speed,
-            ``(..., 2)`` forward and to the right.
-
-    Example:
-        >>> from magrl.envs import GeomagneticNavEnv
-        >>> from torchrl.envs import Compose, TransformedEnv
-        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env = TransformedEnv(base, Compose(Fix(base.field, base.region), CurrentReading(base.field)))
-        >>> bool((env.rollout(3)["next", "current"].abs() < 0.01).all())  # in water without currents
-        True
-    """
-
-    channel = 13
-    stream_key = "current_stream"
-    size, step_draws = 2, 3
-    default_in_keys = ("field", "heading", "fix", "position")
-    default_out_keys = ("current",)
-    optional_in_keys = ("true_current", "true_field", STD_KEYS[0])
-
-    def __init__(self, field: FieldModel, **options: Any) -> None:
-        super().__init__(**options)
-        self.field, self.numbers_key = field, self.out_keys[0]
-
-    def _constants(self, stream: Tensor) -> Tensor:
-        return stream.new_zeros(*stream.shape, self.size, dtype=torch.float64)
-
-    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:  # noqa: ARG002
-        seen = self._named(values)
-        course = seen["heading"].double().squeeze(-1)
-        ahead = torch.stack((torch.cos(course), torch.sin(course)), -1)
-        distance, bearing = polar(-BASE_KM * (ahead + seen.get("true_current", torch.zeros_like(ahead))))
-        before = elements_at(self.field, move_place(seen["position"], bearing, distance)).double()
-        difference = element_difference(seen.get("true_field", seen["field"]).double(), before)
-        if STD_KEYS[0] in seen:  # of the difference of two readings
-            difference = difference + math.sqrt(2) * seen[STD_KEYS[0]] * stream_normal(episode.stream, self.step_draws)
-        value, gradient = self.field.value_and_gradient(*seen["fix"].unbind(-1))
-        unit = per_nanotesla(measured_elements(value))
-        jacobian = elements_gradient(value, gradient) / unit.unsqueeze(-1)
-        current = displacement_to(difference / unit, jacobian) / BASE_KM - ahead
-        return turned(current, -course.unsqueeze(-1)).to(seen["heading"].dtype)
 
 
 class RecentLegs(StatefulTransform):

@@ -18,7 +18,8 @@ from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES
 from magrl.transforms.areas import SEEN
 from magrl.transforms.base import Keys, ObservationTransform
-from magrl.transforms.legs import CurrentReading, Fix, RecentLegs
+from magrl.transforms.currents import CurrentReading, ExpectedCurrents
+from magrl.transforms.legs import Fix, RecentLegs
 from magrl.transforms.scaling import MinMaxNorm
 
 READING_SIZES = {"field": 3, "target_field": 3, "leg": 2, "heading": 1, "elapsed_steps": 1}
@@ -114,7 +115,7 @@ class _View:
 
     @property
     def mirror(self) -> Tensor | None:
-        """Signs ``(size,)`` of an observation in the mirror image of an episode, if that is one of the task, too."""
+        """Linear map ``(size, size)`` of an observation to the mirror image, if that is an episode of the task, too."""
         return None
 
     def __post_init__(self) -> None:
@@ -257,8 +258,9 @@ class ObservationView(_View):
 
 @dataclass(frozen=True, kw_only=True)
 class LegsView(_View):
-    """Describe the observation of the last legs (:class:`~magrl.transforms.RecentLegs`) and of the current at the
-    vehicle's place (:class:`~magrl.transforms.CurrentReading`), which needs a map.
+    """Describe the observation of the last legs (:class:`~magrl.transforms.RecentLegs`), of the current at the
+    vehicle's place (:class:`~magrl.transforms.CurrentReading`), which needs a map, and of the currents to expect around
+    it (:class:`~magrl.transforms.ExpectedCurrents`).
 
     Args:
         count: number of legs.
@@ -271,7 +273,7 @@ class LegsView(_View):
 
     Example:
         >>> LegsView(max_steps=60, max_leg_km=25.0, max_turn_rad=1.5).size
-        47
+        111
     """
 
     count: int = 8
@@ -284,17 +286,18 @@ class LegsView(_View):
     @property
     def in_keys(self) -> tuple[str, ...]:
         """Keys of the environment that are observed."""
-        return RecentLegs.default_out_keys[0], CurrentReading.default_out_keys[0]
+        return tuple(kind.default_out_keys[0] for kind in (RecentLegs, CurrentReading, ExpectedCurrents))
 
     @property
     def size(self) -> int:
         """Number of entries of ``observation``."""
-        return RecentLegs(self.count).size + CurrentReading.size
+        return RecentLegs(self.count).size + CurrentReading.size + ExpectedCurrents.size
 
     @property
     def mirror(self) -> Tensor:
-        """Signs ``(size,)`` of an observation in the mirror image of an episode: what is to the right changes its."""
-        return torch.tensor([1.0, -1, 1, 1, 1, *self.count * [1, -1, 1, -1, 1], 1, -1])
+        """Linear map ``(size, size)`` of an observation to the mirror image: what is to the right changes its sign."""
+        signs = torch.tensor([1.0, -1, 1, 1, 1, *self.count * [1, -1, 1, -1, 1], 1, -1])
+        return torch.block_diag(torch.diag(signs), ExpectedCurrents.mirror())
 
     def needed(self, env: EnvBase) -> list[Transform]:
         """Return the transforms that write what is observed, with the map of an environment."""
@@ -308,6 +311,7 @@ class LegsView(_View):
             Fix(base.field, base.scenario.edge, fix),
             CurrentReading(base.field, in_keys=current),
             RecentLegs(self.count, self.max_steps),
+            ExpectedCurrents(),
         ]
 
     def observation_transforms(self) -> list[Transform]:
