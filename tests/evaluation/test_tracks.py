@@ -37,7 +37,7 @@ TASK_DIGESTS = {
     "magrl/GeomagneticNavigationReadings-v2": ("cfb5b2950f361556", 169.094),
     "magrl/GeomagneticNavigationStorm-v2": ("b5326d98869b964b", 152.084),
     "magrl/GeomagneticNavigationNoGo-v1": ("6e38ee89a111935e", -4.402),
-    "magrl/GeomagneticNavigationEddies-v1": ("4fe5c87e60c06f19", 178.059),
+    "magrl/GeomagneticNavigationEddies-v2": ("4fe5c87e60c06f19", 527.46),
 }
 """By id: of eight starts, fields and the ends of a leg; observations and rewards of ten, in one number."""
 FIRST, SIZE = np.array([1, 0]), np.array([25, 1.5])  # of actions in km and rad, from those in [-1, 1]

@@ -25,7 +25,7 @@ from magrl.transforms.track import READ_KEYS
 FLAGS = ("done", "terminated", "truncated")
 SIZES = {"field": 3, "target_field": 3, "leg": 2, "heading": 1, "elapsed_steps": 1, "position": 2}
 SIZES |= {"target_position": 2, "start_position": 2, "true_displacement": 2, "highest_spl": 1, "step_price": 1}
-SIZES |= {"fix": 2, "target_fix": 2, "earned_spl": 1, "path_km": 1, "trip_km": 1}
+SIZES |= {"fix": 2, "target_fix": 2, "earned_spl": 1, "path_km": 1, "trip_km": 1, "recent_legs": 45, "current": 2}
 SIZES |= {"gradient_heading": 1, "number": 1, "field_gradient": 6} | dict.fromkeys(("success", *FLAGS), 1)
 LEAST = {"field": (5.0, -16.0, 35000.0), "target_field": (6.0, -20.0, 35500.0), "true_displacement": (300.0, 100.0)}
 LEAST |= {"position": (3.0, 160.0), "target_position": (6.0, 163.0), "start_position": (2.0, 159.0)}

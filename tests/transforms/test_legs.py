@@ -14,13 +14,15 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions
 from magrl.errors import MotionError, SensorErrors
+from magrl.errors.motion import EDDIES, eddy_velocity, eddy_waves
 from magrl.field.elements import elements_gradient
 from magrl.field.model import elements_at
 from magrl.field.spherical import SphericalHarmonicField
-from magrl.geodesy import geodesic
-from magrl.named_tasks import eddies_env
-from magrl.transforms import Fix, RecentLegs
+from magrl.geodesy import geodesic, move_place
+from magrl.named_tasks import EDDY_MOTION, eddies_env
+from magrl.transforms import ExpectedCurrents, Fix, RecentLegs
 from magrl.transforms.areas import turned
+from magrl.transforms.currents import eddy_covariance
 from magrl.transforms.sequences import per_nanotesla
 from magrl.transforms.views import LegsView
 
@@ -153,8 +155,9 @@ def test_the_observation_follows_from_readings_and_legs_alone() -> None:
     seen = steps.select(*PUBLIC, "fix", "target_fix", "legs", *(("next", key) for key in PUBLIC))
     assert_close(legs[0](seen)["next", "fix"], steps["next", "fix"])
     assert_close(legs[1](seen)["next", "recent_legs"], steps["next", "recent_legs"])
-    both = torch.cat((steps["next", "recent_legs"], steps["next", "current"]), -1)
-    assert_close(steps["next", "observation"], both)
+    expected = ExpectedCurrents()(steps["next"].select("recent_legs", "current"))["expected_currents"]
+    parts = steps["next", "recent_legs"], steps["next", "current"], expected
+    assert_close(steps["next", "observation"], torch.cat(parts, -1))
 
 
 def test_a_mirror_image_is_an_episode_of_the_task() -> None:
@@ -175,4 +178,46 @@ def test_a_mirror_image_is_an_episode_of_the_task() -> None:
         return recent(step.set("next", after))["next", "recent_legs"]
 
     assert state["observation"].shape[-1] == env.view.size == len(env.view.mirror)
-    assert_close(flown(east), flown(torch.ones(2, dtype=torch.float64)) * view.mirror[:-2].double(), atol=1e-9, rtol=0)
+    mirror = view.mirror[:20, :20].double()
+    assert_close(flown(east), flown(torch.ones(2, dtype=torch.float64)) @ mirror, atol=1e-9, rtol=0)
+    seen = env.rollout(5, break_when_any_done=False)["observation"]  # expected currents, too
+    image = (seen @ env.view.mirror.T)[..., :47]
+    expected = ExpectedCurrents()(TensorDict(recent_legs=image[..., :45], current=image[..., 45:], batch_size=[4, 5]))
+    assert_close(expected["expected_currents"], (seen @ env.view.mirror.T)[..., 47:], atol=1e-4, rtol=0)
+
+
+# The currents to expect
+
+
+def test_the_covariance_of_eddies_is_that_of_their_currents() -> None:
+    """Of 20 000 fields of random waves, at two places 60 km apart; theirs have a mean square of 1 for both axes."""
+    numbers = torch.rand(20_000, 3 * EDDIES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    phases, directions = numbers.tensor_split([EDDIES], -1)
+    waves, phases = eddy_waves(directions, 250.0), 2 * math.pi * phases
+    place = torch.tensor([5.0, 30.0], dtype=torch.float64)
+    distance, bearing = torch.tensor([60.0, 0.7], dtype=torch.float64)
+    here, there = (
+        eddy_velocity(at.expand(20_000, 2), waves, phases) for at in (place, move_place(place, bearing, distance))
+    )
+    apart = distance * torch.stack((bearing.cos(), bearing.sin())) * 2 * math.pi / 250
+    assert_close(2 * here.T @ there / 20_000, eddy_covariance(apart), atol=0.03, rtol=0)
+
+
+def test_expected_currents_are_near_the_true_ones() -> None:
+    """Their error is below .15 of the root mean square 15 km away after eleven legs, and grows with the distance."""
+    steps = eddies_env(64, seed=0).rollout(12, break_when_any_done=False)[:, -1]
+    phases, directions = steps["motion_error"].double()[:, 3:].tensor_split([EDDIES], -1)
+    target = torch.atan2(*steps["recent_legs"].double()[:, :2].flip(-1).unbind(-1)) + steps["heading"].double()[:, 0]
+    expected, errors = steps["expected_currents"].double().unflatten(-1, (4, 8, 2)), []
+    for ring, distance in enumerate((15.0, 40.0, 75.0, 120.0)):
+        for number in range(8):
+            place = move_place(steps["position"], target + number * math.pi / 4, torch.full_like(target, distance))
+            true = 0.9 * eddy_velocity(place, eddy_waves(directions, 250.0), phases)
+            errors.append((turned(true, -target.unsqueeze(-1)) - expected[:, ring, number]).square().sum(-1))
+    near, *others = torch.stack(errors).unflatten(0, (4, 8)).mean((1, 2)).sqrt() / 0.9
+    assert near < 0.15
+    assert near < others[0] < others[1] < others[2] < 0.8
+
+
+def test_the_wavelength_is_the_task_s() -> None:
+    assert ExpectedCurrents().eddy_km == EDDY_MOTION["eddy_km"]
