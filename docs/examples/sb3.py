@@ -62,8 +62,8 @@ class Config:
     """Width of hidden layers: two of PPO, three of SAC and TD3."""
     batch_size: int = 256
     """Transitions per gradient step, of SAC and TD3."""
-    geometry: bool = False
-    """Whether the fixed layer of the recipes' networks (magrl.navigators.networks.Geometry) is the first one."""
+    geometry: bool = True
+    """Whether the fixed layer of the recipes' networks (magrl.navigators.networks.Geometry) is the first one, if any."""
     episodes: int = 200
     """Episodes of each score."""
     seed: int = 0
@@ -88,9 +88,10 @@ def make_model(config: Config) -> BaseAlgorithm:
     """Return an agent."""
     vehicles = GeomagneticNavVectorEnv(config.num_envs, task=config.task, autoreset_mode="SameStep")
     envs, first = BatchedVecEnv(vehicles), dict[str, Any]()
-    if config.geometry:
+    view = getattr(vehicles.torchrl_env, "view", None)
+    if config.geometry and view is not None and view.geometry is not None:
         first["features_extractor_class"] = Features
-        first["features_extractor_kwargs"] = {"view": vehicles.torchrl_env.view}
+        first["features_extractor_kwargs"] = {"view": view}
     settings: dict[str, Any] = {name: getattr(config, name) for name in ("learning_rate", "gamma", "seed")}
     settings["device"] = "cpu"
     if config.algorithm == "ppo":

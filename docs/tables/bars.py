@@ -4,16 +4,15 @@
 
 The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 1000 vehicles starts the same episodes. Oracles are
 the true bearing, which knows where vehicle and destination are, the shortest paths around no-go areas, all or those
-seen so far, and the plan on the true map of the currents. Plans on estimated currents are of the first 200 vehicles.
-The rule around the areas in sight reads public keys alone. *Readings* has the episodes of *Anywhere*: only what a
-policy observes is different.
+seen so far, and the plan on the true map of the currents. The rule around the areas in sight reads public keys alone.
+*Readings* has the episodes of *Anywhere*: only what a policy observes is different.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -30,7 +29,7 @@ from magrl.navigators import Kalman, Navigator
 from magrl.navigators.names import make_navigator
 from magrl.navigators.quasi_newton import last_leg
 from magrl.training import command
-from magrl.transforms.areas import CLEAR_KM, RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, shielded, turned
+from magrl.transforms.areas import CLEAR_KM, RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, Shield, distance_km, shielded, turned
 from magrl.transforms.track import READ_KEYS, track_of
 
 import torch
@@ -39,7 +38,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-VEHICLES, FEWER = 1000, {"estimated": 200, "mapped": 200}
+VEHICLES = 1000
 STEP_PRICE, STORM_PRICE = 0.05, 0.1
 """Price of a step [% of SPL] of kalman and anywhere, where the score has none, chosen among .02, .05, .1, .2 and .5; in
 a storm, more steps find less."""
@@ -49,12 +48,18 @@ COLUMNS = ("score", "SR", "SPL", "steps", "ms")
 BARS = {"secant": "secant", "kalman": "kalman, cheap steps", "anywhere": "anywhere (pretrained), cheap steps"}
 BARS |= {"memory": "memory (trained on storm)", "readings-ppo_memory": "memory (trained on readings)"}
 BARS |= {"told": "kalman, cheap steps, which knows the size of each error"}
+BARS |= {"shielded": "secant behind the shield of the recipe"}
 BARS |= {"around": "shortest path around the areas seen so far, by kalman"}
 BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}
 BARS |= {"parallel": "parallel (oracle)", "offset": "bearing that offsets half of the last set (a map)"}
 BARS |= {"estimated": "plan on a Gaussian process of the currents (a map, their spectrum)"}
 BARS |= {"mapped": "plan on the true currents (oracle)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
+
+
+BEHIND: dict[str, tuple[str, Callable[[], Sequence[Transform]]]]
+BEHIND = {"told": ("kalman", partial(storm_errors, stated=True)), "shielded": ("secant", lambda: [Shield()])}
+"""Navigators behind transforms."""
 
 
 class Shown(NamedTuple):
@@ -171,9 +176,10 @@ def sighted_km(areas: Tensor) -> tuple[Tensor, Tensor]:
 
 def flown(task: str, navigator: str, vehicles: int | None = None, **options: Any) -> tuple[EnvBase, TensorDictBase]:
     """Return the environment of a task with options, and the first episode of each vehicle; as of :func:`bar`."""
-    options |= {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
+    name, transforms = BEHIND.get(navigator, (navigator, list))
+    options |= {"transforms": transforms()} if navigator in BEHIND else {}
     observation = "legs" if navigator in CURRENT_RULES else "dict"  # rules of currents read the fixes of a map
-    count = min(vehicles or VEHICLES, FEWER.get(navigator, math.inf))
+    count = vehicles or VEHICLES
     env = NAMED_TASKS[task].make(count, observation=observation, scale_actions=False, seed=SEED, **options)
     rules: dict[str, Any] = {
         "detour": Detour,
@@ -181,7 +187,6 @@ def flown(task: str, navigator: str, vehicles: int | None = None, **options: Any
         "around": partial(Around.for_env, env.base_env, step_price=STEP_PRICE),
     }
     rules |= {name: partial(rule, env.base_env.max_leg_km) for name, rule in CURRENT_RULES.items()}
-    name = "kalman" if navigator == "told" else navigator
     price = STORM_PRICE if task == "storm" else STEP_PRICE
     priced = {"step_price": price} if name in ("kalman", "anywhere") else {}
     policy = rules[name]() if name in rules else make_navigator(name, env.base_env, **priced)

@@ -32,9 +32,10 @@ COLUMNS = ("easier", "the named task", "harder", "with noise")
 
 
 class Ladder(NamedTuple):
-    """A task, the agents that fly it, and the options of each level."""
+    """A task, its levels in words, the agents that fly it, and the options of each level."""
 
     task: str
+    about: str
     agents: tuple[str, ...]
     levels: list[dict[str, Any]]
 
@@ -43,9 +44,9 @@ EDDIES = [*({"eddies_km_h": speed} for speed in (0.5, 0.9, 1.2)), {"transforms":
 DISCS = [{"discs": number} for number in (2, 4, 8)]
 STORMS = [{"transforms": storm_errors(replace(STORM, variation=x * STORM.variation))} for x in (0.5, 1.0, 2.0)]
 LADDERS = (
-    Ladder("eddies", ("eddies", "offset", "parallel", "geodesic"), EDDIES),
-    Ladder("nogo", (NOGO, "around", "detour"), DISCS),
-    Ladder("storm", ("memory", "kalman", "secant"), STORMS),
+    Ladder("eddies", "0.5, 0.9, 1.2 km/h", ("eddies", "offset", "parallel", "geodesic"), EDDIES),
+    Ladder("nogo", "2, 4, 8 discs", (NOGO, "shielded", "around", "detour"), DISCS),
+    Ladder("storm", "weather × 0.5, 1, 2", ("memory", "kalman", "secant"), STORMS),
 )
 
 
@@ -76,11 +77,11 @@ def main(out: Path = Path("docs/results"), vehicles: int = 1000) -> None:
         vehicles: Number of episodes.
     """
     rows = []
-    for (task, _, levels), agent in tqdm([(ladder, agent) for ladder in LADDERS for agent in ladder.agents]):
+    for (task, about, _, levels), agent in tqdm([(ladder, agent) for ladder in LADDERS for agent in ladder.agents]):
         scores = [scored(flown(task, agent, vehicles, **options)[1]) for options in levels]
         cells = [f"{score['SR']:.1f} / {score['SPL']:.1f}" for score in scores]
         label = BARS.get(agent, Path(agent).stem.partition("-")[2] or agent)
-        rows.append([task, label, *cells, *["—"] * (len(COLUMNS) - len(cells))])
+        rows.append([f"{task}: {about}", label, *cells, *["—"] * (len(COLUMNS) - len(cells))])
     write_text(out / "ladder.md", markdown_table(["task", "agent", *COLUMNS], rows) + "\n")
     rows = [[task, agent, *(elsewhere(task, agent, vehicles, o) for o in REGIONS.values())] for task, agent in TRAINED]
     write_text(out / "elsewhere.md", markdown_table(["task", "agent", *REGIONS], rows) + "\n")

@@ -197,7 +197,7 @@ def behind(flights: DataFrame, name: str) -> str:
     if not rules:
         return "—"
     best = scores[max(rules, key=lambda rule: scores[rule].mean())]
-    return spread(scores[name][:, : best.shape[1]] - best, "+.1f")
+    return spread(scores[name] - best, "+.1f")
 
 
 def place_of(episodes: DataFrame) -> Callable[[tuple[str, str]], tuple[int, int]]:
