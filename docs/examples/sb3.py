@@ -63,7 +63,7 @@ class Config:
     batch_size: int = 256
     """Transitions per gradient step, of SAC and TD3."""
     geometry: bool = True
-    """Whether the fixed layer of the recipes' networks (magrl.navigators.networks.Geometry) is the first one, if any."""
+    """Whether the fixed layer of the recipes' networks (magrl.navigators.networks.Geometry) is first, if there is one."""
     episodes: int = 200
     """Episodes of each score."""
     seed: int = 0
