@@ -63,7 +63,7 @@ class Config:
     batch_size: int = 256
     """Transitions per gradient step, of SAC and TD3."""
     geometry: bool = True
-    """Whether the fixed layer of the recipes' networks (magrl.navigators.networks.Geometry) is first, if there is one."""
+    """Whether the fixed layer of the recipes' networks, if any (magrl.navigators.networks.Geometry), is the first."""
     episodes: int = 200
     """Episodes of each score."""
     seed: int = 0
