@@ -35,7 +35,7 @@ from magrl.navigators.names import make_navigator
 from magrl.random_numbers import stream_normal
 from magrl.sensor_std import OUTAGE_STD, STD_KEYS, SensorStd
 from magrl.transforms import TrackField
-from magrl.transforms.episode import Episode
+from magrl.transforms.episode import Episode, EpisodeNumbers
 
 NAMES = [name for name in CONDITIONS if name != "laboratory"]
 
@@ -206,6 +206,16 @@ def test_files_of_errors_that_are_refused(tmp_path: Path, text: str | None, mess
         (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         conditions_named(str(tmp_path / "mine.toml"))
+
+
+def test_no_two_errors_draw_the_same_random_numbers() -> None:
+    kinds, channels = [EpisodeNumbers], []
+    while kinds:
+        kind = kinds.pop()
+        kinds += [child for child in kind.__subclasses__() if child.__module__.startswith("magrl.")]
+        channels += [vars(kind)["channel"]] if "channel" in vars(kind) else []
+    assert len(channels) > 8
+    assert sorted(channels) == sorted(set(channels))
 
 
 class Temperature(ReadingErrors):
