@@ -239,7 +239,7 @@ def no_go_env(num_envs: int = 1, *, discs: int = 4, **options: Any) -> Transform
     return env
 
 
-@named_task("Eddies", version=2, threshold=9.7)
+@named_task("Eddies", version=2, threshold=9.72)
 def eddies_env(num_envs: int = 1, *, eddies_km_h: float = EDDY_MOTION["eddies_km_h"], **options: Any) -> TransformedEnv:
     """Return the environment *Box* of an underwater glider at 1 km/h, in eddies that are about as fast.
 
