@@ -247,7 +247,7 @@ class Command:
         error_radius_km: radius that holds the destination with the ``confidence`` of the options.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
             the distance is then 0.
-        reason: why to stop, as text; in the first command, what was not checked.
+        reason: why to stop, as text; without a stop, what is not read, or in the first command, what was not checked.
         place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
         place_covariance_km2: covariance of the place, northward and eastward.
         drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the distance;

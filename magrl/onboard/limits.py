@@ -39,7 +39,8 @@ LEAST_NT = 2000.0
 """Least B_H for an agent without a map: below, it fails more often (docs/results.md, the whole globe) [nT]."""
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
-of the longest legs [km]. Coarse readings of one element can stay equal that long; chosen."""
+of the longest legs [km]; the first also without a complete reading before it is reported. Coarse readings of one
+element can stay equal that long; chosen."""
 ANYWHERE = ((-180.0, -90.0, 0.0), (180.0, 90.0, math.inf))
 """Least and greatest D [deg], I [deg], B_H [nT] of a reading."""
 LEAST_LEG_STD_KM = 1.0

@@ -337,7 +337,9 @@ class Onboard:
         stop, reason = self._stop(track, decision, radius)
         if not (stop or self._steps or self._template.known is not None):
             reason = f"{_UNCHECKED[self.options.north]} not checked: give the start"
-        reason = reason if stop else self._doubt.text or reason
+        unread = f"no complete reading over the last {self._unread_km:.0f} km"
+        unread = unread if self._unread_km >= limits.STUCK_KM[0] else ""
+        reason = reason if stop else self._doubt.text or unread or reason
         distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
         steer = math.degrees(course + turn) % 360.0
         north, east = track.displacement.mean.tolist()

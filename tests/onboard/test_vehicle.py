@@ -480,6 +480,19 @@ def test_a_stuck_sensor(held: tuple[int, ...], std: Triple, legs: int | None, re
             break
 
 
+@pytest.mark.parametrize("missing", [(0, 1, 2), (0,)])
+def test_a_long_path_without_a_complete_reading_is_reported(missing: tuple[int, ...]) -> None:
+    """It is no stop, and ends with a complete reading."""
+    vehicle = begun(sensor_std=NOISE)
+    vehicle.step(*HERE, 290.0)
+    read = [None if index in missing else value + 0.01 for index, value in enumerate(HERE)]
+    commands = [vehicle.step(*read, 290.0, leg) for leg in (50.0, 49.9, 0.1, 0.0)]
+    commands.append(vehicle.step(HERE[0] + 0.1, HERE[1] + 0.1, HERE[2] - 9.0, 290.0, 0.0))
+    text = "no complete reading over the last 100 km"
+    assert [command.reason for command in commands] == ["", "", text, text, ""]
+    assert {command.stop for command in commands} == {None}
+
+
 def test_a_vehicle_without_true_north_takes_no_declination() -> None:
     vehicle = begun("kalman", (None, 74.0, 14000.0), north="magnetic", sensor_std=NOISE)
     with pytest.raises(ValueError, match=r"declination 3\.5: headings are from magnetic north, .* None"):
