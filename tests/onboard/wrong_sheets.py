@@ -5,6 +5,7 @@ crust is the gradient of a random potential of its own in each flight. All error
 states, but for what a row breaks. Rows share the places and the random numbers of flights of the same number.
 
     OMP_NUM_THREADS=1 python tests/onboard/wrong_sheets.py --flights 120 --seed 1 --jobs 2 --out flights.csv
+    python tests/onboard/wrong_sheets.py --rows failures --vehicle ship --flights 40 --seed 77
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ DATE = "2025-01-01"  # the last of IGRF-13
 SURVEY_STD, SPIKE = np.array((0.1, 0.05, 30.0)), np.array((0.3, 0.3, 300.0))
 WEATHER_KM, CRUST_KM, WAVES = 125.0, 100.0, 128  # path over which correlations fall to 1 / e; chosen
 STORM_KM, STORM_STEPS = 667.0, 24  # about twice the way to the destination; chosen
-WRONG = "log drift bias survey unstated off_km crust_nt there_nt storm_nt timed_nt gyro_deg frozen climb_km spike"
+WRONG = "log drift bias survey unstated off_km crust_nt there_nt storm_nt timed_nt gyro_deg frozen climb_km spike "
+WRONG += "fails since"
 
 
-class Row(namedtuple("Row", f"name start date {WRONG}", defaults=(True, DATE, *3 * [1.0], *11 * [0]))):
+class Row(namedtuple("Row", f"name start date {WRONG}", defaults=(True, DATE, *3 * [1.0], *13 * [0]))):
     """What the vehicle knows, and what is false of it.
 
     Args:
@@ -57,7 +59,22 @@ class Row(namedtuple("Row", f"name start date {WRONG}", defaults=(True, DATE, *3
         frozen: whether D stays that of the first reading.
         climb_km: altitude after the first reading.
         spike: error of the first reading, over SPIKE.
+        fails: what :func:`reported` makes of readings.
+        since: from which step on.
     """
+
+
+def reported(fails: str, reading: Sequence, held: Sequence, heading: float) -> tuple[Sequence, float]:
+    """Reading and heading as the vehicle reports them, given the last reading before the failure of a row."""
+    d, i, level = reading
+    return {
+        "frozen D": ((held[0], i, level), heading),
+        "frozen": (held, heading),
+        "nothing read": ((None, None, None), heading),
+        "heading in radians": (reading, np.radians(heading)),
+        "B_H in microtesla": ((d, i, level / 1000), heading),
+        "wrong sign of I": ((d, -i, level), heading),
+    }.get(fails, (reading, heading))
 
 
 NOTHING = Row("nothing-exact", start=False, date=None)
@@ -79,6 +96,14 @@ GROUPS = {
         *(Row("date-2015", date="2015-01-01"), Row("spike", spike=1.0)),
         *(Row("start-unknown", start=False), Row("start-unknown-crust-30", start=False, crust_nt=30.0)),
     ),
+    "failures": [
+        *(Row("right-too"), Row("frozen-d-too", fails="frozen D"), Row("frozen-d-later", fails="frozen D", since=4)),
+        *(Row("frozen-later", fails="frozen", since=4), Row("nothing-read", fails="nothing read", since=4)),
+        *(
+            Row(name.replace(" ", "-"), fails=name)
+            for name in ("heading in radians", "B_H in microtesla", "wrong sign of I")
+        ),
+    ],
 }
 ROWS = {row.name: row for group in GROUPS.values() for row in group}
 OUTCOMES = "arrived", "nearest, within 25 km", "false", "nearest elsewhere", "lost, refused"
@@ -210,10 +235,14 @@ class World:
 def flown(row: Row, vehicle: str, number: int, seed: int, **options: object) -> Flight:
     """Fly one flight, which depends on the arguments alone."""
     world = World(row, CONDITIONS[vehicle], (seed, number), **options)
-    last, refused, distance, spike = None, [], 0.0, row.spike * SPIKE
+    last, refused, distance, spike, held = None, [], 0.0, row.spike * SPIKE, None
     while not (last and last.stop) and len(refused) < 2:  # of a user, who reads once again
+        reading, heading = world.read(distance) + spike, world.heading
+        held = reading if held is None or world.steps < row.since else held
+        if world.steps >= row.since:
+            reading, heading = reported(row.fails, reading, held, heading)
         try:
-            last = world.vehicle.step(*world.read(distance) + spike, heading=world.heading, distance=distance)
+            last = world.vehicle.step(*reading, heading=heading, distance=distance)
         except ValueError as error:
             refused, spike = [*refused, str(error)], 0.0
             continue
