@@ -55,7 +55,7 @@ class MotionError(EpisodeErrors):
 
     Raises:
         ValueError: for a negative size, errors of the log that could turn a leg around, a current without a speed of
-            the vehicle, another number of keys, or an environment that does not allow the farthest leg.
+            the vehicle, another number of keys, an environment that does not allow the farthest leg, or scaled actions.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -199,7 +199,10 @@ class MotionError(EpisodeErrors):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        commanded = float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max())
+        space = input_spec["full_action_spec"][self.in_keys_inv[0]].space
+        if space.low[..., 0].min() < 0:
+            raise ValueError("MotionError reads actions in km and rad, got scaled ones: put it before their scaling")
+        commanded = float(space.high[..., 0].max())
         spec = observed_spec(self).get(LEG_ERROR, None)
         allowed = 0.0 if spec is None else float(spec.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded

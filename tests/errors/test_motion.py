@@ -21,6 +21,7 @@ from magrl.errors.north import SCHULER_HOURS
 from magrl.evaluation import Flight, evaluate
 from magrl.geodesy import MEAN_RADIUS_KM, geodesic, move
 from magrl.sensor_std import SensorStd
+from magrl.transforms import MinMaxNorm
 
 F64 = torch.float64
 
@@ -119,6 +120,8 @@ def test_the_environment_must_allow_the_farthest_leg() -> None:
         with pytest.raises(ValueError, match=message):
             _ = TransformedEnv(nav(drift_km=drift_km), errors()).specs
     assert TransformedEnv(nav(drift_km=7.01), errors()).action_spec.space.high[0, 0] == 50
+    with pytest.raises(ValueError, match="got scaled ones: put it before their scaling"):
+        _ = TransformedEnv(nav(drift_km=7.01), Compose(MinMaxNorm(in_keys_inv=["action"]), errors())).specs
 
 
 NOISE = (0.02, 0.02, 2.0)

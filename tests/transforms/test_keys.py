@@ -49,7 +49,7 @@ class Foreign(EnvBase):
         for name, value in self._values().items():
             if key(name) not in FLAGS:
                 self.observation_spec[key(name)] = Unbounded(value.shape, dtype=value.dtype)
-        self.action_spec = Composite(action=Bounded(-1.0, 1.0, (*batch, actions)), shape=batch)
+        self.action_spec = Composite(action=Bounded(0.0, 1.0, (*batch, actions)), shape=batch)
         reward = Composite(shape=batch)
         reward[key("reward")] = Unbounded((*batch, 1))
         self.reward_spec = reward
