@@ -118,7 +118,7 @@ class GradientHeading(ObservationTransform):
         out_keys: the heading ``(..., 1)`` [rad] and a mask ``(..., 1)``, False where the gradients are too close to
             parallel to determine a direction (the heading is 0 there).
         pair: two elements, by name (``"D"``, ``"I"``, ``"B_H"``) or by index; or ``"auto"``, where the values are D, I,
-            B_H. The difference in D is wrapped.
+            B_H. The difference in D is taken the shorter way around; by index, none is.
 
     Raises:
         ValueError: for an unknown element, a pair of equal elements, or shapes that do not match.
@@ -148,6 +148,7 @@ class GradientHeading(ObservationTransform):
 
     def _compute(self, values: list[Tensor]) -> tuple[Tensor, Tensor]:
         value, target, gradient = values
+        self._check_elements(value.shape[-1])
         error, gradient = target - value, gradient.to(value.dtype)
         for column in self.wrapped:
             error[..., column] = torch.rad2deg(wrap_angle(torch.deg2rad(error[..., column])))
@@ -158,15 +159,19 @@ class GradientHeading(ObservationTransform):
             error, gradient = error.gather(-1, pair), gradient.gather(-2, pair.unsqueeze(-1).expand(*pair.shape, 2))
         return guidance.parallel_approach(torch.zeros_like(error), error, gradient)
 
+    def _check_elements(self, count: int) -> None:
+        if max(indices := self.pair or [0, 1, 2]) >= count:
+            raise ValueError(f"GradientHeading takes elements {indices}, counted from 0, but the values have {count}")
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the heading, in [-pi, pi], and its mask."""
         value, target, gradient = (self._leaf(observation_spec, key) for key in self.in_keys)
-        indices = [0, 1, 2] if self.pair is None else self.pair
-        if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(indices) >= value.shape[-1]:
+        if value.shape != target.shape or gradient.shape != (*value.shape, 2):
             raise ValueError(
-                f"GradientHeading needs values (..., E), targets (..., E) and gradients (..., E, 2) that hold elements "
-                f"{indices}, got {tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
+                "GradientHeading needs values (..., E), targets (..., E) and gradients (..., E, 2), got "
+                f"{tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
             )
+        self._check_elements(value.shape[-1])
         shape = (*value.shape[:-1], 1)
         observation_spec[self.out_keys[0]] = Bounded(-math.pi, math.pi, shape, device=value.device, dtype=value.dtype)
         observation_spec[self.out_keys[1]] = Binary(1, shape, device=value.device, dtype=torch.bool)

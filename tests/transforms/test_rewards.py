@@ -261,7 +261,8 @@ MISTAKES: dict[str, Callable[[], object]] = {
     r"got \(2, 3\)": lambda: guided(FieldGradient(paper_field(), ["field"])).specs,
     r"values \(E,\), got \(\)": lambda: guided(FieldGradient(lambda position: position.sum(-1))).specs,
     r"\(2, 3\), \(2, 2\)": lambda: guided(GradientHeading(["field", "leg", "field_gradient"])).specs,
-    r"\[0, 3\].*\(2, 3\)": lambda: guided(GradientHeading(pair=(0, 3))).specs,
+    r"\[0, 3\].*have 3$": lambda: guided(GradientHeading(pair=(0, 3))).specs,
+    r"\[0, 7\].*have 2$": lambda: heading_of([0.0, 0.0], [1.0, 1.0], [[0.0, 1.0], [1.0, 0.0]], pair=(0, 7)),
 }
 
 
