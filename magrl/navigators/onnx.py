@@ -102,6 +102,9 @@ def description_of(content: bytes) -> dict[str, Any]:
     Raises:
         ValueError: for a file without one, or of another format.
     """
+    if not has_view(content):
+        remedy = "score it with magrl.score, or save it with what it observes by save_policy('policy.onnx', FILE, view)"
+        raise ValueError(f"it is a bare network: {remedy}")
     found = dict(json.loads(_session(content).get_modelmeta().custom_metadata_map.get(DESCRIPTION, "{}")))
     if (version := found.pop("format", None)) != FORMAT:
         message = f"its metadata have {DESCRIPTION!r} of format {short(version)}; this version reads format {FORMAT}"

@@ -7,6 +7,7 @@ transforms and is used like every other navigator.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from magrl.navigators.kalman import Anywhere
 from magrl.navigators.memory import Memory
 from magrl.navigators.networks import Device, make_actor
 from magrl.navigators.onnx import OnnxNetwork, description_of, exported, with_description
-from magrl.pilot.network import save_pilot
+from magrl.pilot.network import pretrained, save_pilot
 from magrl.policy_files import PolicyFile, read_policy, reading
 from magrl.transforms import LegsView, ObservationView, ReadingView
 from magrl.transforms.areas import shielded
@@ -280,7 +281,8 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     """Read a policy that :func:`save_policy` wrote. Reading a file runs no code from it.
 
     Args:
-        path: ``policy.safetensors`` of a run, or another file of :func:`save_policy`.
+        path: ``policy.safetensors`` of a run, another file of :func:`save_policy`, or the name of an agent, such as
+            ``"box-TD3"``.
         device: device on which the policy acts.
 
     Raises:
@@ -294,6 +296,8 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
         FileNotFoundError: there is no policy file at policy.safetensors
     """
     check_device(device)
+    with suppress(ValueError):
+        path = pretrained(str(path))
     if Path(path).suffix == ".onnx" and Path(path).is_file():
         return _load_onnx(path).to(device).eval()
     file = read_policy(path, "pilot", "memory", *VIEWS)

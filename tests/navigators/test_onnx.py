@@ -205,7 +205,7 @@ def test_damaged_files_are_refused(own: Path, tmp_path: Path) -> None:
         (described(lambda content: content | {"format": 7}), ""),
         (described(lambda content: content | {"kind": "map"}), ""),
         (described(lambda content: content | {"view": {"max_leg_km": -1}}), ""),
-        (lambda model: model.ClearField("metadata_props"), r"by save_policy\('policy.onnx', FILE, view\)"),
+        (lambda model: model.ClearField("metadata_props"), "a bare network: score it with magrl.score, or save it"),
     ):
         model, path = ModelProto.FromString(own.read_bytes()), tmp_path / "changed.onnx"
         change(model)

@@ -168,6 +168,12 @@ def test_settings_of_a_training_are_checked(policy, tmp_path: Path) -> None:
             assert str(path) in str(error.value)
 
 
+def test_a_shipped_agent_has_a_name() -> None:
+    assert load_policy("nogo-TD3").config == load_policy(pretrained("nogo-TD3")).config
+    with pytest.raises(ValueError, match=r"box-SB3-PPO.onnx .*: it is a bare network"):
+        load_policy("box-SB3-PPO")
+
+
 def test_missing_policy_and_foreign_file(tmp_path: Path) -> None:
     for read in (load_policy, lambda path: Anywhere(source=path)):
         with pytest.raises(FileNotFoundError, match=r"no policy file at .*none\.pt"):
