@@ -189,7 +189,7 @@ class EpisodeSum(StatefulTransform):
     TorchRL's ``RewardSum`` takes rewards alone.
 
     Args:
-        in_keys: numbers ``(..., 1)``, 0 at a reset. Each sum is named after its key, with the prefix ``episode_``.
+        in_keys: numbers ``(..., E)``, 0 at a reset. Each sum is named after its key, with the prefix ``episode_``.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -203,12 +203,19 @@ class EpisodeSum(StatefulTransform):
     def __init__(self, in_keys: Keys) -> None:
         parts = [key if isinstance(key, tuple) else (key,) for key in key_list(in_keys)]
         super().__init__(in_keys, [(*path, f"episode_{name}") for *path, name in parts])
-        self.out_sizes = dict.fromkeys(self.out_keys, (1,))
 
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it: the sums."""
         return self.out_keys
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the sums, unbounded."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        for key, total in zip(self.in_keys, self.out_keys, strict=True):
+            leaf = self._leaf(observation_spec, key)
+            self._add(observation_spec, leaf, total, *leaf.shape[-1:])
+        return observation_spec
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         self._advance(tensordict, values, values)

@@ -60,7 +60,7 @@ def guided() -> Transform:
 def rewarded() -> Transform:
     """Rewards of agents without a map, with what a policy with a memory sees."""
     rewards = RandomStepPrice((0.1, 1.0)), TrueDisplacement(), HighestSPL(), SPLReward(), NoGoAreas(), Shield()
-    others = KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity"])
+    others = KnownPlace(5.0, 2.0), ReadingObservation(), EpisodeSum(["reward_proximity", "leg"])
     return Compose(*rewards, *others)
 
 
