@@ -33,13 +33,15 @@ class ObservationTransform(Transform):
 
     Example:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> class Kilometers(ObservationTransform):
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> class Degrees(ObservationTransform):
+        ...     out_sizes = {"heading_deg": (1,)}
         ...     def _compute(self, values):
-        ...         return [values[0] / 1000]
-        >>> depth = TensorDict(depth_m=torch.tensor([500.0]))
-        >>> Kilometers(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
-        tensor([0.5000])
+        ...         return [torch.rad2deg(values[0])]
+        >>> env = TransformedEnv(GeomagneticNavEnv(seed=0), Degrees(in_keys=["heading"], out_keys=["heading_deg"]))
+        >>> env.rollout(3)["heading_deg"].shape
+        torch.Size([1, 3, 1])
     """
 
     default_in_keys: Keys = ()
@@ -53,7 +55,7 @@ class ObservationTransform(Transform):
     in_sizes: Mapping[NestedKey, tuple[int, ...]] = {}
     """Last dimensions of the values by name; others may have any."""
     out_sizes: Mapping[NestedKey, tuple[int, ...]] = {}
-    """Last dimensions of unbounded values that are written, by name."""
+    """Last dimensions of unbounded values that are written, by name: an environment needs them."""
 
     def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, **inverse: Any) -> None:
         self.in_names, ins = _chosen(in_keys, self.default_in_keys, self.optional_in_keys)
@@ -72,10 +74,13 @@ class ObservationTransform(Transform):
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
         """Return the values at ``out_keys``, given those at ``in_keys``."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no method _compute(values), which returns what it writes")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key, value in zip(self.out_keys, self._compute(self._read(next_tensordict)), strict=True):
+        values = self._compute(self._read(next_tensordict))
+        if isinstance(values, Tensor) or len(values) != len(self.out_keys):
+            raise ValueError(f"{type(self).__name__}._compute must return a list, a tensor for each of {self.out_keys}")
+        for key, value in zip(self.out_keys, values, strict=True):
             next_tensordict.set(key, value)
         return next_tensordict
 
@@ -169,16 +174,17 @@ class StatefulTransform(ObservationTransform):
 
     Example:
         >>> import torch
-        >>> from tensordict import TensorDict
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> class Odometer(StatefulTransform):
-        ...     state_keys = ["path_km"]
+        ...     state_keys, out_sizes = ["path_km"], {"path_km": (1,)}
         ...     def _begin(self, tensordict, values, mask):
-        ...         tensordict["path_km"] = values[0]
+        ...         tensordict["path_km"] = values[0][..., :1]
         ...     def _advance(self, tensordict, values, state):
-        ...         tensordict["path_km"] = state[0] + values[0]
-        >>> step = TensorDict(path_km=torch.tensor([5.0]), next=TensorDict(leg=torch.tensor([2.0])))
-        >>> Odometer(in_keys=["leg"], out_keys=["path_km"])(step)["next", "path_km"]
-        tensor([7.])
+        ...         tensordict["path_km"] = state[0] + values[0][..., :1]
+        >>> env = TransformedEnv(GeomagneticNavEnv(seed=0), Odometer(in_keys=["leg"], out_keys=["path_km"]))
+        >>> env.rollout(3, lambda td: td.set("action", torch.tensor([[30.0, 0.0]])))["next", "path_km"].flatten()
+        tensor([30., 60., 90.])
     """
 
     @property

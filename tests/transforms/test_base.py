@@ -38,7 +38,7 @@ from magrl.transforms import (
     TrackField,
     TrueDisplacement,
 )
-from magrl.transforms.base import key_list
+from magrl.transforms.base import ObservationTransform, key_list
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 
@@ -172,6 +172,20 @@ def test_a_value_without_its_last_dimension_is_refused(transform: Transform) -> 
         transform(TensorDict(th=torch.tensor(0.0)))
     with pytest.raises(ValueError, match=message):
         TransformedEnv(PendulumEnv(), transform.clone()).rollout(2)
+
+
+@pytest.mark.parametrize(
+    ("own", "error", "message"),
+    [
+        ({}, NotImplementedError, r"Own has no method _compute\(values\)"),
+        ({"_compute": lambda _, values: 2 * values}, ValueError, r"Own._compute must return a list.* \['x'\]$"),
+        ({"_compute": lambda _, values: values[0]}, ValueError, r"Own._compute must return a list"),
+    ],
+)
+def test_what_a_transform_of_ones_own_lacks_is_named(own: dict, error: type[Exception], message: str) -> None:
+    kind = type("Own", (ObservationTransform,), own | {"out_sizes": {"x": (1,)}})
+    with pytest.raises(error, match=message):
+        TransformedEnv(nav(1), kind(["heading"], ["x"])).rollout(1)
 
 
 def test_keys_are_lists_in_the_order_of_the_names() -> None:
