@@ -226,6 +226,9 @@ def policy_env(env: EnvBase, policy: nn.Module, **rules: Any) -> EnvBase:
         policy: navigator, recurrent module of TorchRL, or a module that holds them; others need nothing.
         **rules: values of :class:`~magrl.pilot.Rules` beside the limits of the environment, such as ``confidence``.
 
+    Raises:
+        ValueError: for a navigator in an environment with scaled actions.
+
     Example:
         >>> from magrl.navigators import Secant
         >>> env, secant = GeomagneticNavEnv(num_envs=2, seed=0), Secant()
@@ -236,6 +239,8 @@ def policy_env(env: EnvBase, policy: nn.Module, **rules: Any) -> EnvBase:
     modules: Any = policy.modules() if isinstance(policy, nn.Module) else ()
     for module in modules:
         if isinstance(module, Navigator):
+            if "observation" not in module.in_keys and env.action_spec.space.low[..., 0].min() < 0:
+                raise ValueError(f"{module.name} acts in km and rad: take an environment with scale_actions=False")
             steps += module.transforms(env, **rules)
         elif hasattr(module, "make_tensordict_primer") and "is_init" not in env.observation_spec.keys():  # noqa: SIM118
             steps += [InitTracker(), module.make_tensordict_primer()]

@@ -13,6 +13,7 @@ from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, trip_set
+from magrl.envs.navigation import navigation_env
 from magrl.errors import Conditions, SensorErrors, with_conditions
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.tables import short_table
@@ -243,6 +244,12 @@ def test_bad_options_are_refused_with_their_value() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_a_navigator_needs_physical_actions() -> None:
+    env = navigation_env(2, seed=0)
+    with pytest.raises(ValueError, match="secant acts in km and rad: take an environment with scale_actions=False"):
+        policy_env(env, Secant())
 
 
 def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
