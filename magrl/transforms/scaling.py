@@ -30,7 +30,7 @@ class MinMaxNorm(ObservationTransform):
         in_keys_inv: entries of the environment that are filled from scaled ones, usually ``["action"]``.
         out_keys_inv: names of those scaled entries; the same by default.
         bounds: (low, high) of each key of the environment, numbers or tensors of one shape, the last dimensions;
-            other keys take theirs from the specs.
+            other keys take theirs from the specs, and ``("next", key)`` those of ``key``.
         interval: image of the bounds.
 
     Raises:
@@ -74,11 +74,13 @@ class MinMaxNorm(ObservationTransform):
         for index in range(len(self._bounded_keys)):
             self.register_buffer(f"low_{index}", None)
             self.register_buffer(f"high_{index}", None)
-        bounds = {} if bounds is None else bounds
-        for key, pair in bounds.items():
+        bounds = {unravel_key(key): pair for key, pair in (bounds or {}).items()}
+        after = {unravel_key(("next", key)): pair for key, pair in bounds.items()}
+        after = {key: after[key] for key in self._bounded_keys if key in after}
+        for key, pair in (bounds | after | bounds).items():
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
                 raise ValueError(f"the bounds of {key!r} must be (low, high), got {pair!r}")
-            self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in pair))
+            self._set_bounds(key, *(_as_float(bound) for bound in pair))
 
     # Bounds
 

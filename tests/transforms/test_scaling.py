@@ -66,6 +66,17 @@ def test_buffer_stores_physical_actions_and_samples_scaled_ones(name: NestedKey)
     assert torch.equal(sample[name], scaled[sample["row"]])
 
 
+def test_a_buffer_scales_what_follows_by_the_same_bounds() -> None:
+    """Of a nested key, too, and unless what follows has bounds of its own."""
+    keys = ["x", ("a", "y"), "z", ("next", "x"), ("next", "a", "y"), ("next", "z")]
+    bounds = {"x": (0.0, 4.0), ("a", "y"): (0.0, 8.0), ("next", "z"): (0.0, 2.0), "z": (0.0, 16.0)}
+    rb = TensorDictReplayBuffer(storage=LazyTensorStorage(1), batch_size=1, transform=MinMaxNorm(keys, bounds=bounds))
+    values = TensorDict(x=torch.tensor([2.0]), a=TensorDict(y=torch.tensor([2.0])), z=torch.tensor([2.0]))
+    rb.extend(values.clone().set("next", values).auto_batch_size_())
+    sample = rb.sample()
+    assert [float(sample[key]) for key in keys] == [0.0, -0.5, -0.75, 0.0, -0.5, 1.0]
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_round_trip_is_exact_at_both_ends(dtype: torch.dtype) -> None:
     """And bounds that are given as numbers are as exact as the data."""
