@@ -6,7 +6,7 @@ transform holds no state.
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -67,7 +67,9 @@ class EpisodeNumbers(StatefulTransform):
     step_draws = 0
     """Random numbers of each reading."""
 
-    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, *, seed: int = 0) -> None:
+    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, *, seed: int = 0, **bad: Any) -> None:
+        if bad:
+            raise TypeError(f"{type(self).__name__} has no option {', '.join(bad)}")
         super().__init__(in_keys, out_keys)
         check_number(whole=True, seed=seed)
         self.seed = int(seed)

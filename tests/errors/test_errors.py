@@ -152,3 +152,5 @@ def test_bad_shapes_and_keys() -> None:
         _ = under(SensorErrors((1.0, 1.0))).specs
     with pytest.raises(ValueError, match="would overwrite 'target_field', which the environment reads back"):
         _ = under(SensorErrors(STD, in_keys=["target_field"], out_keys=["target_field"])).specs
+    with pytest.raises(TypeError, match="SensorErrors has no option foo"):
+        SensorErrors(foo=1)
