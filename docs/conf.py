@@ -118,14 +118,14 @@ def link_names(app: Any, doctree: nodes.document, page: str) -> None:
 
 
 def list_names(app: Any, doctree: nodes.document, page: str) -> None:
-    """List the classes and functions of a page of the API below its title."""
+    """List the classes and functions of a page of the API below its title, by their paths in its package."""
     entries = app.env.domains.python_domain.objects
     kinds = {"class", "function", "exception"}
     names = [name for name, entry in entries.items() if (entry.docname, entry.aliased) == (page, False)]
     names = sorted((name for name in names if entries[name].objtype in kinds), key=lambda name: name.rpartition(".")[2])
     listed = nodes.paragraph()
     for name in names if page.startswith("api/") else ():
-        label = nodes.literal(text=name.rpartition(".")[2])
+        label = nodes.literal(text=name.removeprefix(f"magrl.{page.removeprefix('api/')}."))
         listed += [make_refnode(app.builder, page, page, entries[name].node_id, label), nodes.Text(" ")]
     if listed.children:
         doctree.next_node(nodes.section).insert(1, listed)
