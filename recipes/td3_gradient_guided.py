@@ -4,7 +4,7 @@
     python recipes/td3_gradient_guided.py --preset td3-fast   # without guidance, by the task's reward
     python recipes/td3_gradient_guided.py --preset paper      # Table 1 and eight additions; hours on a CPU
     python recipes/td3_gradient_guided.py --task nogo         # around no-go areas; three minutes
-    python recipes/td3_gradient_guided.py --task eddies       # in currents as fast as the vehicle; six minutes
+    python recipes/td3_gradient_guided.py --task eddies       # in currents as fast as the vehicle; seven minutes
     python recipes/td3_gradient_guided.py --resume RUN        # resume an interrupted run exactly
 
 See docs/start.md.
