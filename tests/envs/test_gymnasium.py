@@ -294,7 +294,7 @@ def test_bad_options() -> None:
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
         (
             {"task": "boxes"},
-            "task must be one of 'box', 'anywhere', 'readings', 'storm', 'nogo', 'eddies', got 'boxes'",
+            f"task must be one of {', '.join(map(repr, NAMED_TASKS))}, got 'boxes'",
         ),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
