@@ -27,7 +27,7 @@ BASE_KM = 2.0
 """Distance of two readings that show a current [km]; chosen."""
 RINGS_KM, DIRECTIONS = (15.0, 40.0, 75.0, 120.0), 8
 """Distances of the places at which currents are expected [km], and number of their directions; chosen."""
-PLACE_ERROR, LEG_ERROR = 0.015, 0.05
+PLACE_STD, LEG_STD = 0.015, 0.05
 """Standard deviations of the current at the vehicle's place, and of the set of a leg as the current at its middle, over
 the root mean square of the currents along an axis; chosen."""
 
@@ -136,8 +136,8 @@ class ExpectedCurrents(ObservationTransform):
         met = torch.cat((torch.zeros_like(current).unsqueeze(-2), -LEG_KM * legs[..., :2]), -2) @ to_target.mT
         currents = torch.cat((current.unsqueeze(-2), legs[..., 2:4]), -2) @ to_target.mT
         known = torch.nn.functional.pad(legs[..., 4], (1, 0), value=1.0).repeat_interleave(2, -1)
-        error = torch.full_like(known, LEG_ERROR**2)
-        error[..., :2] = PLACE_ERROR**2
+        error = torch.full_like(known, LEG_STD**2)
+        error[..., :2] = PLACE_STD**2
         gram = self._covariance(met, met) * known.unsqueeze(-1) * known.unsqueeze(-2) + torch.diag_embed(error)
         weights = torch.linalg.solve(gram, known * currents.flatten(-2))
         expected = (self._covariance(self.points.to(met.device), met) * known.unsqueeze(-2)) @ weights.unsqueeze(-1)
