@@ -139,9 +139,15 @@ class ExpectedCurrents(ObservationTransform):
         error = torch.full_like(known, LEG_STD**2)
         error[..., :2] = PLACE_STD**2
         gram = self._covariance(met, met) * known.unsqueeze(-1) * known.unsqueeze(-2) + torch.diag_embed(error)
-        weights = torch.linalg.solve(gram, known * currents.flatten(-2))
-        expected = (self._covariance(self.points.to(met.device), met) * known.unsqueeze(-2)) @ weights.unsqueeze(-1)
-        return [expected.squeeze(-1).to(dtype)]
+        weights = (known * torch.linalg.solve(gram, known * currents.flatten(-2))).unflatten(-1, (-1, 2))
+        return [self._sum(self.points.to(met.device), met, weights).flatten(-2).to(dtype)]
+
+    def _sum(self, places: Tensor, others: Tensor, weights: Tensor) -> Tensor:
+        """Return the covariance of currents at places and others, times weights ``(..., Q, 2)``: ``(..., P, 2)``."""
+        apart = (places.unsqueeze(-2) - others.unsqueeze(-3)) * (2 * math.pi / self.eddy_km)
+        along, across, unit = eddy_covariances(apart)
+        straight = (along - across) * (unit * weights.unsqueeze(-3)).sum(-1)
+        return (straight.unsqueeze(-2) @ unit).squeeze(-2) + across @ weights
 
     def _covariance(self, places: Tensor, others: Tensor) -> Tensor:
         """Return the covariance ``(..., 2 P, 2 Q)`` of currents at places ``(..., P, 2)`` and ``(..., Q, 2)``."""
@@ -175,10 +181,14 @@ def eddy_covariance(apart: Tensor) -> Tensor:
         tensor([[-0.6100,  0.0000],
                 [ 0.0000,  0.3000]])
     """
+    along, across, unit = (part[..., None] for part in eddy_covariances(apart))
+    return (along - across).unsqueeze(-1) * unit * unit.mT + across.unsqueeze(-1) * torch.eye(2, device=unit.device)
+
+
+def eddy_covariances(apart: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the covariances of :func:`eddy_covariance` along and across the displacement, ``(...)`` each, and its
+    unit vector ``(..., 2)``."""
     x = apart.square().sum(-1).clamp_min(1e-12).sqrt()
     whole = torch.sin(x) / x
     along = torch.where(x < 0.01, 1 - x.square() / 10, 3 * (whole - torch.cos(x)) / x.square())
-    unit = apart / x.unsqueeze(-1)
-    across = 3 * whole - 2 * along
-    outer = unit.unsqueeze(-1) * unit.unsqueeze(-2)
-    return (along - across)[..., None, None] * outer + across[..., None, None] * torch.eye(2, device=x.device)
+    return along, 3 * whole - 2 * along, apart / x.unsqueeze(-1)
